@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -106,6 +107,18 @@ def test_the_tutorial_finds_what_was_hidden(tutorial: Read) -> None:
 
 def test_the_report_is_there(tutorial: Read) -> None:
     assert "<svg" in (tutorial.folder / "today.html").read_text()
+
+
+def test_the_report_is_german_if_asked_for_and_its_pictures_too(
+    tutorial: Read, tmp_path: Path
+) -> None:
+    tutorial.names["answer"].report(tmp_path / "heute.html", language="de")
+    page = (tmp_path / "heute.html").read_text()
+    assert '<html lang="de">' in page
+    assert "gemessen" in page
+    assert re.search(r">\d+,\d<", page)  # a tick of an axis
+    assert not re.search(r">\d+\.\d<", page)
+    assert tutorial.names["answer"].plot().axes[0].get_legend_handles_labels()[1][0] == "measured"
 
 
 def test_the_examples_of_the_reference_say_what_happens(monkeypatch: pytest.MonkeyPatch) -> None:

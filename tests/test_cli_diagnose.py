@@ -43,6 +43,25 @@ def other(folder: Path, old: str, new: str) -> Path:
     return path
 
 
+def test_a_report_is_in_the_language_that_was_asked_for(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, "diagnose", log, "--report", "a.html", "--language", "de") == 0
+    page = (here / "a.html").read_text()
+    assert '<html lang="de">' in page
+    assert "Die Aufzeichnung reicht für keine Antwort: " in page
+
+
+def test_a_language_without_texts_is_refused_before_the_work(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "diagnose", log, "-o", "a.html", "--language", "ed") == 2
+    said = capsys.readouterr()
+    assert 'twin: --language: there are no texts in "ed"' in said.err
+    assert said.out == ""
+    assert list(here.iterdir()) == []
+
+
 # Files that cannot be written.
 
 

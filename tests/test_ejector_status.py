@@ -7,7 +7,16 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
 from twin.alarms.text import action_of
 from twin.instants import instant
-from twin.page.ejector_status import S_NS, Light, alarm_cards, episode_details, light_of
+from twin.language import speaking
+from twin.languages import language_of
+from twin.page.ejector_status import (
+    S_NS,
+    Light,
+    alarm_cards,
+    episode_details,
+    facts,
+    light_of,
+)
 
 STATES = {
     "normal": (Kept(), Light.GREEN, Light.GREEN),
@@ -85,3 +94,46 @@ def test_instants_are_worded_as_everywhere() -> None:
     one.resume({"quiet": Kept(True, False, now + 1200 * S_NS)})
     (alarm,) = alarm_cards(one, [], [], now)
     assert alarm["quiet_until"] == "14:41:20, in 20 min"
+
+
+DIAGNOSED = {
+    "words": "leakage (1.98 sl/min), since 2026-11-28 05:11:09; how sure: 83 %; look at cups",
+    "effect": "leakage",
+    "course": "step",
+    "parameters": {
+        "sonic_flow": {"value": 1.982, "unit": "sl/min", "low95": 1.925, "high95": 2.038}
+    },
+    "probability": 0.83,
+    "not_separable_from": ["porous_leakage"],
+    "onset_s": 10.0,
+    "onset_low95_s": 9.91,
+    "onset_high95_s": 10.07,
+    "begin_s": 0.0,
+    "log_begin_ns": 1_000_000_000 * S_NS,
+}
+
+
+def test_evidence_of_a_diagnosis_is_told_in_the_readers_language() -> None:
+    with speaking(language_of("de", "language")):
+        told = dict(facts(DIAGNOSED))
+    assert told["Größe"] == "1,98 sl/min (95 %: 1,93 bis 2,04)"
+    assert ".09.2001 " in told["Zeitraum"]
+    assert "10,0 s nach Beginn der Aufzeichnung (95 %: 9,9 s bis 10,1 s)" in told["Zeitraum"]
+    assert "leakage" not in " ".join(told.values())
+    assert dict(facts(DIAGNOSED))["evidence"] == DIAGNOSED["words"]
+
+
+@pytest.mark.parametrize(
+    ("words", "label", "text"),
+    [
+        (
+            "H1 not reached (highest 612.5 mbar)",
+            "Befund",
+            "H1 nicht erreicht (höchstens 612,5 mbar)",
+        ),
+        ("mqtt: refused 1.5", "Befund (englisch)", "mqtt: refused 1.5"),
+    ],
+)
+def test_evidence_that_is_english_says_so(words: str, label: str, text: str) -> None:
+    with speaking(language_of("de", "language")):
+        assert list(facts({"words": words})) == [(label, text)]

@@ -19,9 +19,11 @@ from test_notifications import NO_TICKS, wait_until
 from twin.alarms.database import open_store
 from twin.alarms.loop import News
 from twin.alarms.settings import board_rules
+from twin.catalogues import Catalogues
 from twin.cli.notifications import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
+from twin.language import ENGLISH
 from twin.notifications import email, sender
 from twin.notifications.dispatch import Outlets
 from twin.notifications.email import EMAIL, MAIL
@@ -31,7 +33,6 @@ from twin.notifications.outbox import open_outbox
 from twin.notifications.sender import LostError, box_of
 from twin.notifications.settings import EmailSettings
 from twin.page.alarm_mail import writer
-from twin.page.catalogues import Catalogues
 from twin.settings import Document
 
 ANN = "ann@plant.example"
@@ -141,7 +142,7 @@ def written(reason: str, *, time_zone: str = "", count: int = 1, code: str = "en
     (message,) = of_event(UNIT, stream.said[0])
     document = json.loads(message.body)
     mail = {"name": "Ann", "address": ANN, "time_zone": time_zone, "reason": reason}
-    write = writer(board_rules(None), Catalogues().texts[code])
+    write = writer(board_rules(None), Catalogues().languages[code])
     return write({**mail, "count": count, "document": document})
 
 
@@ -161,6 +162,8 @@ def test_the_subject_says_how_often() -> None:
 def test_instants_are_in_the_zone_of_who_reads() -> None:
     text = written("raised", time_zone="Europe/Berlin").text
     assert "Since: 2001-09-09 03:46:45 (UTC+02:00)" in text
+    german = written("raised", time_zone="Europe/Berlin", code="de").text
+    assert "Seit: 09.09.2001 03:46:45 (UTC+02:00)" in german
 
 
 def test_a_diagnosed_cause_says_how_sure() -> None:
@@ -169,7 +172,7 @@ def test_a_diagnosed_cause_says_how_sure() -> None:
     document = json.loads([*of_event(UNIT, stream.said[-1])][-1].body)
     document["evidence"] |= {"probability": 0.93, "not_separable_from": ["end_vacuum_loss"]}
     mail = {"name": "Ann", "address": ANN, "time_zone": "", "reason": "raised", "count": 1}
-    letter = writer(board_rules(None), {})({**mail, "document": document})
+    letter = writer(board_rules(None), ENGLISH)({**mail, "document": document})
     assert letter.subject == "gripper-01: medium priority, Suction loss"
     assert "How sure: diagnosed: 93 %; this log cannot tell it from" in letter.text
 
@@ -177,7 +180,7 @@ def test_a_diagnosed_cause_says_how_sure() -> None:
 def test_an_alarm_whose_rule_is_gone_is_told_in_its_own_words() -> None:
     document = json.loads(next(of_event(UNIT, leak().said[0])).body)
     mail = {"name": "Ann", "address": ANN, "time_zone": "", "reason": "raised", "count": 1}
-    letter = writer((), {})({**mail, "document": document})
+    letter = writer((), ENGLISH)({**mail, "document": document})
     assert "Deviation leakage" in letter.subject
     assert "What to do: Look at hoses" in letter.text
 

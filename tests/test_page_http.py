@@ -240,6 +240,11 @@ def test_a_report_is_shown_and_nothing_in_it_is_run(site: Site) -> None:
     assert answer.text == "<h1>Leakage</h1>"
     assert "sandbox" in answer.headers["content-security-policy"]
     assert "script-src" not in answer.headers["content-security-policy"]
+    headers = {"accept-language": "de"}
+    assert site.client.get(f"/reports/0/{REPORT}", headers=headers).text == "<h1>Leakage</h1>"
+    (folder / f"{REPORT}.de.html").write_text("<h1>Leckage</h1>")
+    assert site.client.get(f"/reports/0/{REPORT}", headers=headers).text == "<h1>Leckage</h1>"
+    assert site.client.get(f"/reports/0/{REPORT}").text == "<h1>Leakage</h1>"
     (folder / "other.html").write_text("none of ours")
     assert site.client.get("/reports/0/other").status_code == 404
     gone = site.client.get(f"/reports/0/{'f' * 32}")

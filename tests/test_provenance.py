@@ -140,6 +140,7 @@ NEEDS_EXTRA = {
     "twin/exchange/fmu_file.py": "aas",
     "twin/exchange/submodels.py": "aas",
     "twin/fleet/engines.py": "dask",
+    "twin/catalogues.py": "serve",
     "twin/page/": "serve",
     "twin/view.py": "view",
 }

@@ -47,8 +47,10 @@ from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError
+from twin.languages import language_of
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
+from twin.model.mechanism import MECHANISMS
 from twin.model.term import KINDS, Term
 from twin.monitor.bins import Floats
 from twin.monitor.healthy import ModelError
@@ -346,7 +348,7 @@ def test_order_is_sentence_then_steps_then_pictures_then_numbers(pages: dict[str
 def test_two_causes_have_a_card_a_course_and_a_row_each(pages: dict[str, str]) -> None:
     headings = Outline(pages["two"]).headings
     assert headings[0] == (
-        "Two causes together: leakage (1.98 sl/min, since 10.0 s into the log) and weak blow-off"
+        "2 causes together: leakage (1.98 sl/min, since 10.0 s into the log) and weak blow-off"
         " (10 %, growing from the beginning of the log)."
     )
     assert headings[2:4] == ["Leakage", "Weak blow-off"]
@@ -444,6 +446,79 @@ def test_a_report_that_cannot_be_written_is_an_error_for_people(tmp_path: Path) 
     with pytest.raises(SourceError, match=r"missing/report\.html: cannot be written") as caught:
         write_report(insufficient(), tmp_path / "missing" / "report.html")
     assert "folder" in caught.value.hint
+
+
+# --- in another language --------------------------------------------------------------------------
+
+RECORD = (
+    "record cycles with a blow-off of 1 s: leakage and porous_leakage are predicted to part by"
+    " 12 sigma"
+)
+SHAPE = {"where": "hold", "depends_on": ["vacuum"]} | {
+    "shape": "up to +22.5 mbar of pressure, at 31 ms after it begins"
+}
+ENGLISH_WORDS = re.compile(
+    r"\b(the|and|of|with|is|are|from|that|not|which|cause|log|cycles?|by|to|mean|expected|left)\b"
+)
+
+
+@pytest.fixture(scope="module")
+def german(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """German pages; all of their visible texts, pictures and alternatives included."""
+    folder = tmp_path_factory.mktemp("german")
+    values = {"loss": 43.5, "sets_in": 3.25, "fades": 10.5}
+    found = MECHANISMS["suction_nozzle_on_slowly"]
+    mechanism = {
+        "name": found.name,
+        "sentence": found.sentence(values),
+        "formula": found.formula(values),
+        "parameters": {"loss": {"value": 43.5, "unit": "%", "low95": 36.3, "high95": 51.9}},
+        "not_separable_from": [MECHANISMS["suction_always"].sentence({"loss": 40.5})]
+        if "suction_always" in MECHANISMS
+        else [],
+    }
+    diagnoses = {
+        "explained": explained(next_experiment=RECORD),
+        "two": diagnosis("two", answer(causes=[LEAK, BLOW_OFF], next_experiment=RECORD)),
+        "some": diagnosis("some", answer(causes=[DELAY], next_experiment=None)),
+        "part": explained(verdict="unlisted", unlisted=SHAPE, next_experiment=RECORD),
+        "unlisted": unexplained("unlisted", unlisted=SHAPE | {"mechanism": mechanism}),
+        "consistent": unexplained("consistent"),
+        "insufficient": insufficient(),
+    }
+    pages = {}
+    for verdict, one in diagnoses.items():
+        write_report(one, folder / "a.html", language_of("de", "language"))
+        pages[verdict] = (folder / "a.html").read_text(encoding="utf-8")
+    return pages
+
+
+def visible(page: str) -> str:
+    """What a person reads or hears, without what was given: the log's name and the program's."""
+    texts = re.findall(r">([^<>]+)<", re.sub(r"<style.*?</style>", "", page, flags=re.DOTALL))
+    texts += re.findall(r'aria-label="([^"]*)"', page)
+    return re.sub(r"ejector-twin [\d.]+|\w+\.mcap", "", "\n".join(texts))
+
+
+@pytest.mark.parametrize("name", ["explained", "two", "some", "part", "unlisted", "consistent"])
+def test_a_german_page_is_german_in_each_word_and_number(name: str, german: dict[str, str]) -> None:
+    text = visible(german[name])
+    assert '<html lang="de">' in german[name]
+    assert ENGLISH_WORDS.findall(text) == []
+    assert re.findall(r"\d\.\d", text) == []
+    assert len(re.findall(r"\d,\d", text)) > 10
+
+
+def test_why_there_is_no_answer_is_german(german: dict[str, str]) -> None:
+    text = visible(german["insufficient"])
+    assert "mindestens 4 vollständige nacheinander aufzeichnen" in text
+    assert ENGLISH_WORDS.findall(text) == []
+
+
+def test_a_german_sentence_has_the_form_for_its_count(german: dict[str, str]) -> None:
+    assert "Leckage (1,98 sl/min) erklärt die Abweichung" in german["explained"]
+    assert "schwaches Abblasen (10 %) erklären die Abweichung" in german["two"]
+    assert "2 Ursachen zusammen: Leckage" in german["two"]
 
 
 # --- the pictures ---------------------------------------------------------------------------------
@@ -666,7 +741,7 @@ def test_a_mechanism_is_told_with_its_formula_and_all_that_it_may_be_as_well(
     for text in (mechanism["formula"], "First another one", "Then one more", "36.3 to 51.9"):
         assert text in page
         assert text in words
-    assert "What suits best: the ejector moves less air" in words
+    assert "What suits best: The ejector moves less air" in words
     assert page.count("Record it.") == 1
 
 

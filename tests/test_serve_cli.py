@@ -158,8 +158,10 @@ def test_the_process_that_diagnoses_draws_what_it_found(
     path = tmp_path / "new" / "a.html"
     _diagnosed(monkeypatch, path, verdict)
     assert json.loads(capsys.readouterr().out) == {"verdict": verdict}
-    kept = [path] if verdict in ("explained", "unlisted") else []
-    assert list(tmp_path.rglob("*.*")) == kept
+    kept = {"a.html": "in en", "a.de.html": "in de"}
+    assert {one.name: one.read_text() for one in tmp_path.rglob("*.*")} == (
+        kept if verdict in ("explained", "unlisted") else {}
+    )
 
 
 def test_a_report_that_cannot_be_drawn_costs_no_answer(
@@ -176,7 +178,8 @@ def test_the_oldest_reports_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         path = tmp_path / f"{number}.html"
         _diagnosed(monkeypatch, path, "explained")
         os.utime(path, (number, number))
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["2.html", "3.html", "4.html"]
+    names = [f"{number}{code}.html" for number in (2, 3, 4) for code in (".de", "")]
+    assert sorted(one.name for one in tmp_path.iterdir()) == names
 
 
 def _diagnosed(monkeypatch: pytest.MonkeyPatch, path: Path, verdict: str) -> None:
@@ -185,5 +188,7 @@ def _diagnosed(monkeypatch: pytest.MonkeyPatch, path: Path, verdict: str) -> Non
     question = io.BytesIO(pickle.dumps((None, None, "a.mcap", path, 0.0)))
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=question))
     monkeypatch.setattr(diagnosing, "diagnose", lambda *_: found)
-    monkeypatch.setattr(report, "write_report", lambda _found, file: file.write_text("drawn"))
+    monkeypatch.setattr(
+        report, "write_report", lambda _, file, language: file.write_text(f"in {language.code}")
+    )
     diagnosing.main()

@@ -10,17 +10,28 @@ from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
 
-from babel.messages.catalog import Catalog
+from babel.messages.catalog import Catalog, Message
 from babel.messages.extract import extract_from_file
-from babel.messages.pofile import read_po, write_po
+from babel.messages.pofile import write_po
 
 from twin.alarms.causes import cause_of
 from twin.alarms.limits import ADJUSTABLE
 from twin.alarms.rules import by_cause, default_rules
 from twin.alarms.text import COMMISSION
-from twin.diagnosis.text import spoken
+from twin.catalogues import read_catalog
+from twin.diagnosis import text as answer_text
+from twin.diagnosis.curves import DEVIATION
+from twin.diagnosis.experiments import TESTS
+from twin.diagnosis.report import BANNER
+from twin.diagnosis.retelling import templates
+from twin.diagnosis.text import plain_words
+from twin.diagnosis.unlisted import OVER
 from twin.figures.table import FIGURES
+from twin.instants import DATE
+from twin.model.courses import Course
 from twin.model.effects import EFFECTS
+from twin.model.mechanism import PLACES, WHENS
+from twin.model.term import KINDS
 from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.page import ejector_status as light
 from twin.page import plant_overview_text as hall_words
@@ -30,13 +41,13 @@ ROOT = Path(__file__).resolve().parents[1]
 LOCALE = ROOT / "twin" / "locale"
 STATIC = ROOT / "twin" / "page" / "static"
 _OPTIONS = {"parse_template_string": True}  # scripts nest some texts in others
-Text = tuple[str, str]  # location and text
+Text = tuple[str, str | tuple[str, str]]  # location, and text or its singular and plural
 
 
 def texts() -> Iterator[Text]:
     """Every text that is shown in the reader's language."""
-    yield from _in_code(ROOT / "twin", "*.py", "python", "tr")
-    yield from _in_code(STATIC, "*.js", "javascript", "t")
+    yield from _in_code(ROOT / "twin", "*.py", "python", {"tr": None, "ntr": (1, 2)})
+    yield from _in_code(STATIC, "*.js", "javascript", {"t": None, "tn": (1, 2)})
     for path in sorted(STATIC.glob("*.html")):
         for text in MARKED.findall(path.read_text(encoding="utf-8")):
             yield _place(path), text
@@ -45,18 +56,19 @@ def texts() -> Iterator[Text]:
         yield from (("twin/alarms/limits.py", text) for text in (limit.title, limit.what))
 
 
-def _in_code(folder: Path, pattern: str, method: str, keyword: str) -> Iterator[Text]:
-    """Marked texts: ``tr("...")`` in Python, ``t("...")`` in scripts."""
+def _in_code(
+    folder: Path, pattern: str, method: str, keywords: dict[str, tuple[int, int] | None]
+) -> Iterator[Text]:
+    """Marked texts: ``tr("...")`` in Python, ``t("...")`` in scripts; plurals have two."""
     for path in sorted(folder.rglob(pattern)):
-        for message in extract_from_file(method, path, {keyword: None}, options=_OPTIONS):
-            if isinstance(message[1], str):
-                yield _place(path), message[1]
+        for message in extract_from_file(method, path, keywords, options=_OPTIONS):
+            yield _place(path), message[1]
 
 
 def _in_tables() -> Iterator[Text]:
     """Texts in tables of the program."""
     for effect in EFFECTS.values():
-        for text in (spoken(effect.name), effect.sentence, effect.look_at):
+        for text in (plain_words(effect.name), effect.sentence, effect.look_at):
             yield "twin/model/effects.py", text
     for rule in by_cause(default_rules()):
         yield from (("twin/alarms/default.toml", text) for text in (rule.consequence, rule.action))
@@ -73,8 +85,26 @@ def _in_tables() -> Iterator[Text]:
         yield "twin/page/plant_overview_text.py", text
     for status in (400, 401, 403, 404, 503):
         yield "twin/page/app.py", HTTPStatus(status).phrase
-    for phase in ("idle", "suction", "hold", "blow-off"):
-        yield "twin/page/ejector_status.py", phase
+    yield "twin/instants.py", DATE
+    yield from _of_answers()
+
+
+def _of_answers() -> Iterator[Text]:
+    """Texts of a diagnosis that are no literals of its report."""
+    names = [*KINDS, *OVER.values(), "absolute time", "supply", *Course]
+    definitions = [*EFFECTS.values(), *PLACES.values(), *WHENS.values()]
+    names += [parameter.name for entry in definitions for parameter in entry.parameters]
+    for name in names:
+        yield "twin/diagnosis/text.py", plain_words(name)
+    for _, figure, _, unit in answer_text.FIGURES:
+        yield from (("twin/diagnosis/text.py", text) for text in (figure, unit))
+    for reading in answer_text.READ_FROM_ALL.values():
+        yield "twin/diagnosis/text.py", reading
+    for _, _, verdict in BANNER.values():
+        yield "twin/diagnosis/report.py", verdict
+    yield "twin/diagnosis/curves.py", DEVIATION
+    for template in (*templates(), *(test.words for test in TESTS)):
+        yield "twin/diagnosis/retelling.py", template
 
 
 def _place(path: Path) -> str:
@@ -85,16 +115,25 @@ def updated(code: str) -> Catalog:
     """The catalogue of a language with each text once: translated and new ones."""
     path, before = LOCALE / f"{code}.po", Catalog(code)
     if path.exists():
-        before = read_po(path.read_bytes().splitlines(keepends=True), locale=code)
-    after = Catalog(code)
+        before = read_catalog(path.read_bytes(), code)
+    after = Catalog(code.replace("-", "_"))
     for location, text in texts():
-        translated = before.get(text)
-        if text:
-            after.add(text, translated.string if translated else "", locations=[(location, None)])
+        if not text:
+            continue
+        translated = before.get(text[0] if isinstance(text, tuple) else text)
+        is_kept = translated is not None and translated.id == text
+        after.add(text, translated.string if is_kept else "", locations=[(location, None)])
     return after
 
 
-HEAD = "# Texts of the page and of alarms; python tools/texts.py keeps them up to date.\n\n"
+def is_translated(message: Message) -> bool:
+    """Whether a text has a translation, with each of its plural forms."""
+    return all(message.string) if isinstance(message.string, tuple) else bool(message.string)
+
+
+HEAD = (
+    "# Texts of page, alarms, reports and mails; python tools/texts.py keeps them up to date.\n\n"
+)
 
 
 def main() -> None:
@@ -107,7 +146,7 @@ def main() -> None:
         with (LOCALE / f"{code}.po").open("wb") as file:
             file.write(HEAD.encode())
             write_po(file, catalogue, omit_header=True, width=98)
-        empty = sum(not message.string for message in catalogue if message.id)
+        empty = sum(not is_translated(message) for message in catalogue if message.id)
         print(f"{code}: {len(catalogue)} texts, {empty} of them not translated")
 
 

@@ -45,6 +45,7 @@ from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin``
 from twin.extras import install_hint
 from twin.figures.cycle import compiled as key_figures
 from twin.hil import Plant
+from twin.languages import language_of
 from twin.live import Twin
 from twin.log.header import DERIVED, LogHeader
 from twin.log.reader import Log as Recorded
@@ -375,9 +376,14 @@ class Answer:
         """
         return diagnosis_report.draw(self._diagnosis, picture).picture
 
-    def report(self, path: Place) -> None:
-        """Write the answer with pictures as one HTML file; SourceError if it cannot be written."""
-        diagnosis_report.write_report(self._diagnosis, Path(path))
+    def report(self, path: Place, language: str = "en") -> None:
+        """Write the answer with pictures as one HTML file, in a language such as ``de``.
+
+        ConfigError if there are no texts in it, SourceError if the file cannot be written.
+        """
+        diagnosis_report.write_report(
+            self._diagnosis, Path(path), language_of(language, "language")
+        )
 
 
 def open(  # noqa: A001  (as a module's open is called)

@@ -5,9 +5,10 @@ Clock times are in this computer's time zone.
 
 import time
 
-from twin.language import tr
+from twin.language import ntr, tr
 
 SECOND_NS = 1_000_000_000
+DATE, TIME = "%Y-%m-%d", "%H:%M:%S"  # a catalogue has the date of its language
 CALENDAR_NS = 946_684_800 * SECOND_NS  # year 2000: an earlier clock was never set
 
 
@@ -19,14 +20,13 @@ def instant(ns: int, now_ns: int) -> str:
 def clock(ns: int, now_ns: int) -> str:
     """Clock time to the second; with the date unless it is today."""
     instant_time, now_time = time.localtime(ns // SECOND_NS), time.localtime(now_ns // SECOND_NS)
-    return time.strftime(
-        "%H:%M:%S" if instant_time[:3] == now_time[:3] else "%Y-%m-%d %H:%M:%S", instant_time
-    )
+    is_today = instant_time[:3] == now_time[:3]
+    return time.strftime(TIME if is_today else f"{tr(DATE)} {TIME}", instant_time)
 
 
 def dated(ns: int) -> str:
     """Clock time with the date, for stored texts."""
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(ns // SECOND_NS))
+    return time.strftime(f"{tr(DATE)} {TIME}", time.localtime(ns // SECOND_NS))
 
 
 def age(ns: int, now_ns: int) -> str:
@@ -45,7 +45,7 @@ def lasting(seconds: float) -> str:
         return f"{seconds / 60:.0f} min"
     if seconds < 171_000.0:
         return f"{seconds / 3600:.0f} h"
-    return tr("{count} days", count=f"{seconds / 86_400:.0f}")
+    return ntr("{count} day", "{count} days", round(seconds / 86_400))
 
 
 def zone(ns: int) -> int:

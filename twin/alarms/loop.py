@@ -247,7 +247,7 @@ class Alarms:
         former = self._deviation_cause
         main_cause = former if former in causes else next(iter(causes))
         for cause, details in causes.items():
-            entry = _cause_evidence(details) | {"words": event.text}
+            entry = _cause_evidence(details, answer) | {"words": event.text}
             entry |= {"report": event.data["report"]} if "report" in event.data else {}
             if cause == main_cause:
                 entry = self._evidence.get(value_of(former), {}) | entry
@@ -333,9 +333,11 @@ def _received(samples: Samples, time_ns: int, else_ns: int) -> int:
     return int(samples["host_ns"][row]) if row < len(samples) else else_ns
 
 
-def _cause_evidence(cause: Mapping[str, Any]) -> dict[str, Any]:
-    """The evidence that a diagnosis gives for one cause."""
-    keys = ("effect", "course", "parameters", "probability", "not_separable_from")
-    return {key: cause[key] for key in keys if key in cause} | catalogue_evidence(
-        cause.get("effect", "")
-    )
+def _cause_evidence(cause: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
+    """The evidence that a diagnosis gives for one cause, with what tells when it acts."""
+    keys = ["effect", "course", "parameters", "probability", "not_separable_from"]
+    keys += ["onset_s", "onset_low95_s", "onset_high95_s", "cycles", "share_pct"]
+    entry = {key: cause[key] for key in keys if key in cause}
+    log = answer.get("cycles", {})
+    entry |= {key: log[key] for key in ("begin_s", "log_begin_ns") if cause and key in log}
+    return entry | catalogue_evidence(cause.get("effect", ""))

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.alarms.board import SUPPRESSION, Episode
-from twin.instants import SECOND_NS, instant
-from twin.language import tr
+from twin.instants import SECOND_NS, instant, lasting
+from twin.language import numeral, tr
 
 DAY_NS = 86_400 * SECOND_NS
 # Limits that ISA-18.2 (2016) recommends; those of EEMUA 191 (edition 3) are the same.
@@ -100,14 +100,16 @@ def in_words(
 ) -> list[tuple[str, str]]:
     """Label and text of each figure, with what is good; ``title`` names an alarm."""
     average = tr(
-        "{average} in 10 min ({count} in {days} days); up to {limit} can be managed",
-        average=f"{figures.average:.2g}",
+        "{average} in 10 min ({count} in {time}); up to {limit} can be managed",
+        average=numeral(figures.average, ".2g"),
         count=figures.count,
-        days=f"{figures.days:.3g}",
-        limit=f"{MANAGEABLE:g}",
+        time=lasting(86_400.0 * figures.days),
+        limit=numeral(MANAGEABLE, "g"),
     )
     peak = tr("{peak} in 10 min; more than {limit} are a flood", peak=figures.peak, limit=FLOOD)
-    flood = tr("{share} % of the time; below 1 % is good", share=f"{100 * figures.flood_share:.2g}")
+    flood = tr(
+        "{share} % of the time; below 1 % is good", share=numeral(100 * figures.flood_share, ".2g")
+    )
     lists = (
         (
             tr("standing for over 24 h"),

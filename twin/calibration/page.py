@@ -12,6 +12,7 @@ from twin.config import Asset
 from twin.diagnosis import page
 from twin.diagnosis.drawing import as_svg
 from twin.files import write_text
+from twin.language import ENGLISH
 from twin.signals import MBAR, Samples
 
 MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#b36b00"), "refused": ("■", "#b3261e")}
@@ -43,6 +44,7 @@ def write_page(commissioned: Commissioned, asset: Asset, path: Path) -> None:
         page.section("What was found", _parameters(commissioned.calibration)),
     ]
     text = page.PAGE.substitute(
+        language=ENGLISH.code,
         title=html.escape(f"Commissioning of {asset.id}"),
         colour=colour,
         mark=mark,

@@ -120,7 +120,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
     from twin.notifications.settings import chosen, chosen_upload
-    from twin.page.alarm_mail import texts_of
+    from twin.page.alarm_mail import mail_language
 
     for name in document.tables:
         yield partial(document.refuse_unknown_tables, TABLES | set(document.tables) - {name})
@@ -139,7 +139,7 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     yield partial(chosen_rules, document)
     yield partial(chosen, document)
     yield partial(chosen_upload, document)
-    yield partial(texts_of, document)
+    yield partial(mail_language, document)
 
 
 def _line(mistake: str) -> int:

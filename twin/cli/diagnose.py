@@ -16,6 +16,7 @@ from twin.cli.options import (
     AssetsUrl,
     ConfigOption,
     JsonFile,
+    LanguageCode,
     LogFile,
     PageFile,
     UnitId,
@@ -25,6 +26,8 @@ from twin.cli.options import (
 from twin.cli.options import output as output_option
 from twin.cli.setup import settings_of
 from twin.files import require_writable, write_json, write_whole
+from twin.language import ENGLISH
+from twin.languages import language_of
 
 if TYPE_CHECKING:
     from twin.config import Config
@@ -41,6 +44,7 @@ def diagnose(
     output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
     report: PageFile = None,
+    language: LanguageCode = ENGLISH.code,
     save_as: Annotated[
         str, typer.Option(metavar="NEWID", help="Keep the extended model as that of a unit.")
     ] = "",
@@ -65,6 +69,7 @@ def diagnose(
     json_file = chosen(output, "--json", json_file, JSON)
     report = chosen(output, "--report", report, PAGE)
     require_writable(json_file, report, propose)
+    report_language = language_of(language, "--language")
     recorded = open_log(log)
     say_if_cut(recorded, log, "diagnosed")
     other_log = open_log(judge_on) if judge_on else None
@@ -95,7 +100,7 @@ def diagnose(
     if report is not None:
         from twin.diagnosis.report import write_report  # with Matplotlib
 
-        write_report(diagnosis, report)
+        write_report(diagnosis, report, report_language)
     if save_as:
         _save(diagnosis, settings, save_as, assets, log)
     if propose is not None:

@@ -93,14 +93,14 @@ def _email_of(settings: "Config", notifications: "NotificationSettings", say: Sa
     from twin.notifications.call_store import open_calls
     from twin.notifications.email import Email
     from twin.notifications.mail_server import MailServer
-    from twin.page.alarm_mail import texts_of, writer
+    from twin.page.alarm_mail import mail_language, writer
 
     document, unit = settings.document, Unit(settings.asset.type, settings.asset.id)
     return Email(
         notifications,
         MailServer(notifications.email, Path(document.name).parent, say),
         partial(open_calls, place_of(document), unit),
-        writer(board_rules(document), texts_of(document)),
+        writer(board_rules(document), mail_language(document)),
     )
 
 

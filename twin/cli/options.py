@@ -28,6 +28,9 @@ AssetsUrl = Annotated[
 UnitId = Annotated[str, typer.Option("--id", metavar="ID", help="Unit, instead of [asset] id.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="Instead of the one in the log.")]
 AsOf = Annotated[str, typer.Option(metavar="TIME", help="What the asset database knew then, UTC.")]
+LanguageCode = Annotated[
+    str, typer.Option("--language", metavar="CODE", help="Language of the report, such as de.")
+]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
 FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was raised.")]
 

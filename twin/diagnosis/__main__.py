@@ -11,8 +11,9 @@ from pathlib import Path
 
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.errors import TwinError
+from twin.languages import all_languages, translation_of
 
-MOST_REPORTS = 100  # newest reports that a folder keeps
+MOST_REPORTS = 100  # newest reports that a folder keeps, each in all languages
 
 
 def main() -> None:
@@ -29,16 +30,18 @@ def main() -> None:
 
 
 def keep(diagnosis: Diagnosis, report: Path) -> None:
-    """Write the report atomically, and delete the oldest of too many."""
+    """Write the report in each language, atomically, and delete the oldest of too many."""
     from twin.diagnosis.report import write_report  # noqa: PLC0415  # its import takes long
 
     report.parent.mkdir(parents=True, exist_ok=True)
-    part = report.with_suffix(".part")
-    write_report(diagnosis, part)
-    part.rename(report)
-    kept = sorted(report.parent.glob(f"*{report.suffix}"), key=lambda path: path.stat().st_mtime_ns)
-    for old in kept[:-MOST_REPORTS]:
-        old.unlink()
+    for language in all_languages():
+        part = report.with_suffix(".part")
+        write_report(diagnosis, part, language)
+        part.rename(translation_of(report, language.code))
+    english = [path for path in report.parent.glob(f"*{report.suffix}") if "." not in path.stem]
+    for old in sorted(english, key=lambda path: path.stat().st_mtime_ns)[:-MOST_REPORTS]:
+        for file in report.parent.glob(f"{old.stem}.*"):
+            file.unlink()
 
 
 if __name__ == "__main__":

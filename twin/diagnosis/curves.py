@@ -10,12 +10,14 @@ from matplotlib.axes import Axes
 
 from twin.diagnosis.drawing import AFTER, MEASURED, QUIET, Picture, legend
 from twin.diagnosis.text import spoken
+from twin.language import tr
 from twin.monitor.bins import Floats, Ints
 from twin.signals import Phase
 
 COLUMNS = 500  # of a picture's width, each with its lowest and highest values
 MOST_SHADED = 120  # phases; more of them are too narrow to be told apart
 LABELLED = 0.06  # of a picture's width: a narrower phase has no room for its name
+DEVIATION = "measured − expected\n(mbar absolute)"  # what an axis shows
 SHADES = {
     Phase.IDLE: "#ffffff",
     Phase.SUCTION: "#e6f0f8",
@@ -49,15 +51,15 @@ def draw_curves(
         above = below = picture.subplots()
     else:
         above, below = picture.subplots(2, sharex=True, height_ratios=(2, 1))
-        above.plot(time, measured, color=MEASURED, lw=2.2, label="measured")
+        above.plot(time, measured, color=MEASURED, lw=2.2, label=tr("measured"))
         below.axhline(0.0, color=QUIET, lw=0.8)
-        below.set_ylabel("measured − expected\n(mbar absolute)")
+        below.set_ylabel(tr(DEVIATION))
     for curve in expected:
         colour, style = curve.colour, curve.style
         above.plot(time, curve.vacuum, style, color=colour, lw=1.4, label=curve.label)
         if measured is not None:
             below.plot(time, curve.vacuum - measured, style, color=colour, lw=1.4)
-    above.set_ylabel("vacuum\n(mbar below ambient)")
+    above.set_ylabel(tr("vacuum\n(mbar below ambient)"))
     _shade({above, below}, above, time, phase)
     legend(picture, [above])
     return below

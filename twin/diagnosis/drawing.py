@@ -13,9 +13,10 @@ import matplotlib as mpl
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, ScalarFormatter
 
 from twin.files import require_ending, said_plainly
+from twin.language import notation, numeral
 
 WIDTH = 9.6  # inches
 MEASURED, BEFORE, AFTER, QUIET = "#1a1a1a", "#c8500a", "#0a62a8", "#8a8a8a"
@@ -50,6 +51,10 @@ class Picture(Figure):
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Matplotlib's method, in the style of the picture: ticks are made only now."""
+        for axes in self.axes:
+            for axis in (axes.xaxis, axes.yaxis):
+                if isinstance(axis.get_major_formatter(), ScalarFormatter):
+                    axis.set_major_formatter(_Numbers())
         with _style(self.name):
             super().savefig(*args, **options)
 
@@ -61,6 +66,13 @@ class Picture(Figure):
         content = base64.b64encode(as_svg(self).encode()).decode()
         source = f"data:image/svg+xml;base64,{content}"
         return f'<img alt="{html.escape(self.alt)}" style="max-width: 100%" src="{source}">'
+
+
+class _Numbers(ScalarFormatter):
+    """Numbers of an axis in the notation of the chosen language."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return notation(super().__call__(x, pos))
 
 
 @contextmanager
@@ -113,5 +125,5 @@ def logarithmic(axes: Axes, marked: Sequence[float] = (1.0,)) -> None:
     """Make the x axis logarithmic, with plain numbers at ``marked`` in each decade."""
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=marked))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: numeral(x, "g")))
     axes.xaxis.set_minor_locator(NullLocator())

@@ -10,6 +10,7 @@ from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.text import LONG_S, spoken
+from twin.language import tr
 from twin.model.courses import Cause, Course
 from twin.model.effects import Parameter, effect_of
 from twin.monitor.bins import Floats
@@ -31,7 +32,7 @@ def draw_log(diagnosed: Found, alt: str) -> Picture:
             _occurs(top, diagnosed.evidence, answer, colour)
         scale, unit = _scale(diagnosed.evidence)
         top.set_xlim(*_into_log(diagnosed.evidence, diagnosed.evidence.seconds[[0, -1]]) / scale)
-        panels[-1, 0].set_xlabel(f"time in the log ({unit})")
+        panels[-1, 0].set_xlabel(tr("time in the log ({unit})", unit=unit))
         legend(figure, [top])
         return figure
 
@@ -55,18 +56,20 @@ def _deviations(axes: Axes, diagnosed: Found) -> None:
     scale, _ = _scale(evidence)
     times = _middles(evidence)[shown] / scale
     held = np.isin(shown, diagnosed.held_out)
-    models = [(diagnosed.before, BEFORE, 8.0, "twin as it stands")]
+    models = [(diagnosed.before, BEFORE, 8.0, tr("twin as it stands"))]
     if diagnosed.extended:
-        models.append((diagnosed.after, AFTER, 5.0, f"with {diagnosed.name}"))
+        with_causes = tr("with {causes}", causes=diagnosed.name)
+        models.append((diagnosed.after, AFTER, 5.0, with_causes))
     for judged, colour, size, label in models:
         rms = cycle_rms(evidence, judged)[shown]
         axes.plot(times, rms, color=colour, lw=0.8, alpha=0.5)
-        for chosen, face, status in ((~held, colour, "fitted"), (held, "white", "held out")):
+        marks = ((~held, colour, tr("fitted")), (held, "white", tr("held out")))
+        for chosen, face, status in marks:
             full_label = f"{label}, {status}"
             axes.plot(
                 times[chosen], rms[chosen], "o", color=colour, mfc=face, ms=size, label=full_label
             )
-    axes.set_ylabel("rms deviation\nof a cycle (mbar)")
+    axes.set_ylabel(tr("rms deviation\nof a cycle (mbar)"))
     axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
 
 
@@ -133,12 +136,13 @@ def _occurs(axes: Axes, evidence: Evidence, answer: dict[str, Any], colour: str)
     scale, _ = _scale(evidence)
     if "cycles" in answer:
         times = _middles(evidence)[np.isin(evidence.numbers, answer["cycles"])] / scale
-        top, label = np.ones(len(times)), f"{spoken(answer['effect'])} is there"
+        label = tr("{cause} is there", cause=spoken(answer["effect"]))
+        top = np.ones(len(times))
         transform = axes.get_xaxis_transform()
         axes.plot(times, top, "v", color=colour, transform=transform, clip_on=False, label=label)
     if answer["onset_s"] is None:
         return
-    label = f"{spoken(answer['effect'])} begins"
+    label = tr("{cause} begins", cause=spoken(answer["effect"]))
     axes.axvline(answer["onset_s"] / scale, color=colour, lw=1.2, ls=":", label=label)
     if "onset_low95_s" in answer:
         between = (answer[key] / scale for key in ("onset_low95_s", "onset_high95_s"))

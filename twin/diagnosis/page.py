@@ -12,7 +12,7 @@ from string import Template
 from twin.diagnosis.drawing import FORMATS, Picture
 
 PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
+<html lang="$language">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -50,6 +50,14 @@ tbody th { font-weight: 400; white-space: nowrap; }
 td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+@media (max-width: 40rem) {
+  body { margin: .6rem auto; padding: 0 .6rem; }
+  dl, article dl { grid-template-columns: fit-content(9rem) 1fr; gap: .2rem .8rem; }
+  tbody th { white-space: normal; }
+  th, td { padding-right: .7rem; }
+  td, td:nth-child(2) { min-width: 0; }
+  .number { white-space: normal; }
+}
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }
 @media print {

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from twin.diagnosis.covariance import covariance
+from twin.diagnosis.curves import DEVIATION
 from twin.diagnosis.drawing import (
     AFTER,
     BAND,
@@ -24,6 +25,7 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, of_cycles
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.text import spoken
+from twin.language import ntr, tr
 from twin.model import theta as c
 from twin.model.term import KINDS, Term
 from twin.monitor.bins import PER_UNIT, Floats, Ints
@@ -127,10 +129,12 @@ def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> Picture:
                     laid.ms[chosen], explained[chosen], style, color=colour, lw=1.4, label=label
                 )
             logarithmic(panels[-1, column])
-        panels[0, 0].set_ylabel("measured − expected\n(mbar absolute)")
+        panels[0, 0].set_ylabel(tr(DEVIATION))
         if rows > 1:
-            panels[1, 0].set_ylabel(f"left with {diagnosed.name}\n(mbar absolute)")
-        figure.supxlabel("time since the phase began (ms)", fontsize=10)
+            panels[1, 0].set_ylabel(
+                tr("left with {causes}\n(mbar absolute)", causes=diagnosed.name)
+            )
+        figure.supxlabel(tr("time since the phase began (ms)"), fontsize=10)
         legend(figure, panels.flat)
         return figure
 
@@ -138,13 +142,15 @@ def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> Picture:
 def _band(axes: Axes, laid: Laid, chosen: npt.NDArray[np.bool_], reach: Floats) -> None:
     """Draw the 95 % band of the mean of healthy cycles."""
     x, y = laid.ms[chosen], reach[chosen]
-    axes.fill_between(x, -y, y, color=BAND, lw=0, label="healthy (95 %)")
+    axes.fill_between(x, -y, y, color=BAND, lw=0, label=tr("healthy (95 %)"))
     axes.axhline(0.0, color=QUIET, lw=0.8)
 
 
 def _laid_line(axes: Axes, laid: Laid, chosen: npt.NDArray[np.bool_], judged: Judged) -> None:
     mean = laid.mean(judged.off[laid.bins])
-    label = f"deviation, mean of {len(laid.cycles)} cycles"
+    label = ntr(
+        "deviation, mean of {count} cycle", "deviation, mean of {count} cycles", len(laid.cycles)
+    )
     axes.plot(laid.ms[chosen], mean[chosen], color=MEASURED, lw=2.2, label=label)
 
 
@@ -156,14 +162,13 @@ def signatures(diagnosed: Found, laid: Laid) -> list[tuple[Floats, str, str, str
     if not diagnosed.extended:
         return []
     total = laid.mean((diagnosed.before.off - diagnosed.after.off)[laid.bins])
-    result = [(total, AFTER, "-", f"signature of {diagnosed.name}")]
+    result = [(total, AFTER, "-", tr("signature of {causes}", causes=diagnosed.name))]
     if len(diagnosed.causes) > 1:
         alone: list[Hypothesis] = [(cause,) for cause in diagnosed.causes]
         before, *off = off_in(diagnosed.evidence, laid, [HEALTHY, *alone]).T
         for cause, deviation, colour in zip(diagnosed.causes, off, EACH, strict=False):
-            result.append(
-                (laid.mean(before - deviation), colour, "--", f"of {spoken(cause.effect)}")
-            )
+            label = tr("of {cause}", cause=spoken(cause.effect))
+            result.append((laid.mean(before - deviation), colour, "--", label))
     return result
 
 
@@ -197,15 +202,15 @@ def draw_left(diagnosed: Found, laid: Laid, alt: str) -> Picture:
         for axes, x, over in zip(panels, (laid.ms[laid.place], vacuum), OVER, strict=True):
             for kind, colour in zip(kinds, (MEASURED, BEFORE), strict=False):
                 chosen = laid.kind[laid.place] == kind
-                label = f"left in {spoken(KINDS[kind])}"
+                label = tr("left in {phase}", phase=spoken(KINDS[kind]))
                 axes.plot(x[chosen], off[chosen], ".", color=colour, ms=3, label=label)
             axes.axhline(0.0, color=QUIET, lw=0.8)
             shown_terms = [term for term in diagnosed.terms if KINDS.index(term.where) in kinds]
             _terms(axes, [term for term in shown_terms if term.over == over])
-        panels[0].set_xlabel("time since the phase began (ms)")
+        panels[0].set_xlabel(tr("time since the phase began (ms)"))
         logarithmic(panels[0])
-        panels[0].set_ylabel("measured − expected\n(mbar absolute)")
-        panels[1].set_xlabel("vacuum (mbar below ambient)")
+        panels[0].set_ylabel(tr(DEVIATION))
+        panels[1].set_xlabel(tr("vacuum (mbar below ambient)"))
         legend(figure, panels)
         return figure
 
@@ -213,5 +218,5 @@ def draw_left(diagnosed: Found, laid: Laid, alt: str) -> Picture:
 def _terms(axes: Axes, terms: Sequence[Term]) -> None:
     for term in terms:
         x = np.maximum(term.at, EARLIEST_MS) if term.over == "time" else np.array(term.at)
-        label = f"term in {spoken(term.where)}"
+        label = tr("term in {phase}", phase=spoken(term.where))
         axes.plot(x, term.mbar, "o--", color=AFTER, ms=4, lw=1.4, label=label)

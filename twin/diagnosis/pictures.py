@@ -20,7 +20,8 @@ from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.search import Search
-from twin.diagnosis.text import Answer, spoken
+from twin.diagnosis.text import Answer, listed, spoken
+from twin.language import numeral, tr
 from twin.model import theta as c
 from twin.model.term import Term
 from twin.monitor.bins import Ints
@@ -80,9 +81,9 @@ class Found:
         """Short text of what the extended model adds."""
         names = [spoken(cause.effect) for cause in self.listed]
         if len(names) > 1:
-            names = ["all causes"]
-        names += ["the mechanism"] * (len(self.causes) - len(self.listed))
-        return " and ".join([*names, *["a term from data"] * bool(self.terms)])
+            names = [tr("all causes")]
+        names += [tr("the mechanism")] * (len(self.causes) - len(self.listed))
+        return listed([*names, *[tr("a term from data")] * bool(self.terms)])
 
     def numbers(self, cycles: Sequence[int] | Ints) -> list[int]:
         """Numbers of cycles in the log."""
@@ -116,15 +117,16 @@ def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> Picture:
     with empty("cycle", 5.2, alt) as figure:
         phase = evidence.ticks["phase"][rows]
         below = draw_curves(figure, ms, (ambient - measured) / MBAR, models, phase)
-        below.set_xlabel("time since the suction edge (ms)")
+        below.set_xlabel(tr("time since the suction edge (ms)"))
         return figure
 
 
 def _models(diagnosed: Found) -> list[tuple[Judged, str, str, str]]:
-    before = (diagnosed.before, "expected: twin as it stands", BEFORE, "--")
+    before = (diagnosed.before, tr("expected: twin as it stands"), BEFORE, "--")
     if not diagnosed.extended:
         return [before]
-    return [before, (diagnosed.after, f"expected with {diagnosed.name}", AFTER, "-")]
+    with_causes = tr("expected with {causes}", causes=diagnosed.name)
+    return [before, (diagnosed.after, with_causes, AFTER, "-")]
 
 
 def draw_ranking(diagnosed: Found, alt: str) -> Picture:
@@ -137,13 +139,16 @@ def draw_ranking(diagnosed: Found, alt: str) -> Picture:
         axes.hlines(positions, 1.0, leftovers, color=PALE, lw=1.0)
         axes.scatter(leftovers, positions, c=colours, s=60, edgecolors="#444444", zorder=3)
         for x, y in zip(leftovers, positions, strict=True):
-            axes.annotate(f"{x:.2f}", (x, y), (8, 0), textcoords="offset points", va="center")
+            axes.annotate(
+                numeral(x, ".2f"), (x, y), (8, 0), textcoords="offset points", va="center"
+            )
         axes.set_yticks(positions, names)
         logarithmic(axes, WIDE if max(leftovers) > 3.0 * min(1.0, *leftovers) else NARROW)
         axes.axvline(1.0, color=MEASURED, lw=1.2, ls="--")
-        axes.text(1.0, 1.01, "healthy", transform=axes.get_xaxis_transform(), ha="center")
-        axes.set_xlabel("leftover on the fitted cycles (sigma of what healthy cycles scatter)")
+        axes.text(1.0, 1.01, tr("healthy"), transform=axes.get_xaxis_transform(), ha="center")
+        axes.set_xlabel(tr("leftover on the fitted cycles (sigma of what healthy cycles scatter)"))
         axes.margins(x=0.1)
+        axes.set_ylim(-0.6, len(rows) - 0.3)
         return figure
 
 
@@ -153,13 +158,16 @@ def _ranked(diagnosed: Found) -> list[tuple[str, float, str]]:
     rivals = [fitted for fits in search.rivals for fitted in fits]
     shown = {_key(fitted) for fitted in rivals}
     rows = [] if best is None else [(f"▶ {_named(best)}", best.leftover, AFTER)]
-    rows += [(f"≈ {_named(fitted)} (look-alike)", fitted.leftover, "#9cc4e4") for fitted in rivals]
+    rows += [
+        (tr("≈ {cause} (look-alike)", cause=_named(fitted)), fitted.leftover, "#9cc4e4")
+        for fitted in rivals
+    ]
     shown |= {_key(best)} if best else set()
     rest = [fitted for fitted in search.ranking if _key(fitted) not in shown]
     rows += [(_named(fitted), fitted.leftover, PALE) for fitted in rest[:MOST_RANKED]]
     count = search.ranking[0].count
     none = float(np.sqrt(search.healthy / count))
-    return [*rows, ("no cause: the twin as it stands", none, "#ffffff")]
+    return [*rows, (tr("no cause: the twin as it stands"), none, "#ffffff")]
 
 
 def _key(fitted: Fitted) -> tuple[str, ...]:

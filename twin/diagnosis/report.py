@@ -20,17 +20,14 @@ from twin.diagnosis.phase_pictures import (
     unseen,
     worst_kind,
 )
-from twin.diagnosis.pictures import (
-    Found,
-    draw_cycle,
-    draw_ranking,
-    worst_cycle,
-)
+from twin.diagnosis.pictures import Found, draw_cycle, draw_ranking, worst_cycle
+from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import (
     FIGURES,
     Answer,
     Times,
     about,
+    capital,
     change,
     ends,
     extended,
@@ -40,6 +37,7 @@ from twin.diagnosis.text import (
     left_over,
     lines,
     listed,
+    mechanism_lines,
     mechanism_of,
     number,
     signals,
@@ -47,11 +45,14 @@ from twin.diagnosis.text import (
     some,
     spoken,
     to_do,
+    to_find_out,
+    to_record,
     when,
 )
 from twin.errors import ConfigError, known_names
 from twin.files import write_text
 from twin.instants import dated
+from twin.language import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
 from twin.model import theta as c
 from twin.model.courses import Course
 from twin.model.effects import effect_of
@@ -60,7 +61,6 @@ from twin.signals import BAR, MBAR, ML, SL_MIN
 
 Clock = Callable[[], int]  # UTC, ns
 
-RECORD = ("next", "next recording")  # steps that get a box each
 # Colour, mark and text of each verdict's banner.
 BANNER = {
     "consistent": ("#1b6e2e", "✔", "Nothing wrong"),
@@ -75,9 +75,10 @@ def in_words(diagnosis: Diagnosis, clock: Clock = time.time_ns) -> str:
     return lines(diagnosis.json, clock())
 
 
-def write_report(diagnosis: Diagnosis, path: Path) -> None:
+def write_report(diagnosis: Diagnosis, path: Path, language: Language = ENGLISH) -> None:
     """Write the answer with pictures as one HTML file; SourceError if it cannot be written."""
-    write_text(path, _page(diagnosis))
+    with speaking(language):
+        write_text(path, _page(diagnosis))
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -91,7 +92,7 @@ def summary(diagnosis: Diagnosis) -> str:
         return page.summary(f"{mark} {headline(answer, now_ns)}", parts, colour=colour)
     parts.append(_gain_table(answer))
     return page.summary(
-        f"{mark} {verdict}: {headline(answer, now_ns)}",
+        f"{mark} {tr(verdict)}: {headline(answer, now_ns)}",
         parts,
         draw(diagnosis, "cycle").picture,
         colour,
@@ -109,19 +110,20 @@ def _page(diagnosis: Diagnosis) -> str:
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
     times = Times.of(answer, now_ns)
-    parts = [page.section("What to do", "\n".join(_steps(answer, times)))]
+    parts = [page.section(tr("What to do"), "\n".join(_steps(answer, times)))]
     if answer["verdict"] == "insufficient":
-        parts.append(page.section("The log", page.pairs(_cycles(answer))))
+        parts.append(page.section(tr("The log"), page.pairs(_cycles(answer))))
     else:
         diagnosed = Found.of(diagnosis)
         shown = [PICTURES[name](diagnosed, times) for name in _of_verdict(answer)]
         parts += [page.picture(s.title, as_svg(s.picture), s.caption) for s in shown]
-        parts.append(page.section("Numbers", "\n".join(_tables(answer, times))))
+        parts.append(page.section(tr("Numbers"), "\n".join(_tables(answer, times))))
     return page.PAGE.substitute(
-        title=html.escape(f"Diagnosis of {asset}"),
+        language=language_code(),
+        title=html.escape(tr("Diagnosis of {asset}", asset=asset)),
         colour=colour,
         mark=mark,
-        verdict=html.escape(f"{verdict} – {asset}"),
+        verdict=html.escape(f"{tr(verdict)} – {asset}"),
         headline=html.escape(headline(answer, now_ns)),
         body="\n".join(parts),
         footer=_footer(diagnosis, times),
@@ -132,26 +134,33 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
     """A card for each cause and for something unlisted, boxes for signals and recordings."""
     sure = answer["verdict"] == "explained"
     for cause in answer["causes"]:
-        title = spoken(cause["effect"]).capitalize()
-        rows = [row for row in about(cause, times, sure=sure) if row[1] != spoken(cause["effect"])]
-        yield page.card(title, f"{effect_of(cause['effect']).sentence}.", rows)
-    steps = [step for step in to_do(answer) if step[0] not in RECORD]
+        name = spoken(cause["effect"])
+        rows = [row for row in about(cause, times, sure=sure) if row[1] != name]
+        yield page.card(capital(name), f"{tr(effect_of(cause['effect']).sentence)}.", rows)
     if answer["verdict"] == "unlisted":
-        title, text = "Something that no listed cause explains", f"Left in {left_over(answer)}."
-        if mechanism := mechanism_of(answer):
-            title, text = "What suits best, though nobody listed it", f"{mechanism['sentence']}."
-            steps = [step for step in steps if step[0] != "mechanism"]
-        yield page.card(title, text, steps)
+        yield _unlisted_card(answer)
     for contradiction in signals(answer):
         yield page.box(
-            f"The signal {contradiction['signal']}",
-            f"{contradiction['what']}: {contradiction['do']}.",
+            tr("The signal {signal}", signal=contradiction["signal"]),
+            f"{retold(contradiction['what'])}: {retold(contradiction['do'])}.",
         )
-    for title, text in to_do(answer):
-        if title in RECORD:
-            yield page.box(title.capitalize(), f"{text[:1].upper()}{text[1:]}.")
+    for title, text in to_record(answer):
+        yield page.box(capital(title), f"{capital(text)}.")
     if answer["verdict"] == "consistent":
-        yield page.paragraph("Nothing: no cause is worth naming.")
+        yield page.paragraph(tr("Nothing: no cause is worth naming."))
+
+
+def _unlisted_card(answer: Answer) -> str:
+    """A card for something unlisted: its mechanism, or where it is."""
+    if mechanism := mechanism_of(answer):
+        title = tr("What suits best, though nobody listed it")
+        text = f"{retold(mechanism['sentence'])}."
+        rows = [row for row in mechanism_lines(mechanism) if row[0] != tr("mechanism")]
+    else:
+        title = tr("Something that no listed cause explains")
+        text = tr("Left in {where}.", where=left_over(answer))
+        rows = []
+    return page.card(title, text, [*rows, *to_find_out(answer)])
 
 
 # --- pictures -------------------------------------------------------------------------------------
@@ -197,63 +206,71 @@ def _cycle_picture(diagnosed: Found, _times: Times) -> Shown:
     answer, worst = diagnosed.answer, worst_cycle(diagnosed)
     (cycle,) = diagnosed.numbers([worst])
     title = _verdict_in_numbers(answer)
-    alt = f"{title}. Vacuum in cycle {cycle}, measured and expected, and the deviation, over time."
-    caption = (
-        f"Cycle {cycle} of {answer['cycles']['total']} (counted from 0): of those held out from the"
-        " fit, the one furthest off. The rms is over all held-out cycles. A deviation above zero is"
-        " too little vacuum."
+    alt = tr(
+        "Vacuum in cycle {cycle}, measured and expected, and the deviation, over time.", cycle=cycle
     )
-    return Shown(title, draw_cycle(diagnosed, worst, alt), caption)
+    caption = tr(
+        "Cycle {cycle} of {total} (counted from 0): of those held out from the fit, the one"
+        " furthest off. The rms is over all held-out cycles. A deviation above zero is too little"
+        " vacuum.",
+        cycle=cycle,
+        total=answer["cycles"]["total"],
+    )
+    return Shown(title, draw_cycle(diagnosed, worst, f"{title}. {alt}"), caption)
 
 
 def _log_picture(diagnosed: Found, times: Times) -> Shown:
     answer = diagnosed.answer
     parts = [f"{spoken(cause['effect'])} {when(cause, times)}" for cause in answer["causes"]]
-    title = f"Over time: {'; '.join(parts) or 'no cause comes or goes'}"
-    alt = f"{title}. Rms deviation of each cycle, before and after, and the size of each cause."
-    caption = (
+    course = "; ".join(parts) or tr("no cause comes or goes")
+    title = tr("Over time: {course}", course=course)
+    alt = tr("Rms deviation of each cycle, before and after, and the size of each cause.")
+    caption = tr(
         "A filled mark is a cycle that was fitted, an empty one was held out to judge by. Cycles in"
         " which the model still swings in are left out."
     )
     if answer["causes"]:
-        caption += " Below: the size of each cause with its 95 % interval; dotted: as it should be."
-    return Shown(title, draw_log(diagnosed, alt), caption)
+        sizes = tr("Below: the size of each cause with its 95 % interval; dotted: as it should be.")
+        caption = f"{caption} {sizes}"
+    return Shown(title, draw_log(diagnosed, f"{title}. {alt}"), caption)
 
 
 def _phases_picture(diagnosed: Found, _times: Times) -> Shown:
     laid = laid_over(diagnosed.evidence, acting(diagnosed))
     title = _where(diagnosed, laid)
-    alt = f"{title}. Mean deviation over the time since each phase began."
-    caption = (
-        f"Mean over the cycles {some(diagnosed.numbers(laid.cycles))}: {_which(diagnosed, laid)}. A"
-        " deviation above zero is too little vacuum. The band is where 95 % of such means of"
-        " healthy cycles lie."
+    alt = tr("Mean deviation over the time since each phase began.")
+    caption = tr(
+        "Mean over the cycles {cycles}: {which}. A deviation above zero is too little vacuum. The"
+        " band is where 95 % of such means of healthy cycles lie.",
+        cycles=some(diagnosed.numbers(laid.cycles)),
+        which=_which(diagnosed, laid),
     )
-    return Shown(title, draw_phases(diagnosed, laid, alt), caption)
+    return Shown(title, draw_phases(diagnosed, laid, f"{title}. {alt}"), caption)
 
 
 def _left_picture(diagnosed: Found, _times: Times) -> Shown:
     laid = laid_over(diagnosed.evidence, unseen(diagnosed))
-    title = f"What no listed cause explains: {left_over(diagnosed.answer)}"
-    alt = f"{title}. Mean deviation left over time since the phase began and over vacuum."
-    caption = (
-        f"The held-out cycles {some(diagnosed.numbers(laid.cycles))} laid over each other. On what"
-        " it depends, over that the dots form one curve. A deviation above zero is too little"
-        " vacuum."
+    title = tr("What no listed cause explains: {where}", where=left_over(diagnosed.answer))
+    alt = tr("Mean deviation left over time since the phase began and over vacuum.")
+    caption = tr(
+        "The held-out cycles {cycles} laid over each other. On what it depends, over that the dots"
+        " form one curve. A deviation above zero is too little vacuum.",
+        cycles=some(diagnosed.numbers(laid.cycles)),
     )
     if diagnosed.terms:
-        caption += " Dashed: the term that takes it away in the extended model."
-    return Shown(title, draw_left(diagnosed, laid, alt), caption)
+        term = tr("Dashed: the term that takes it away in the extended model.")
+        caption = f"{caption} {term}"
+    return Shown(title, draw_left(diagnosed, laid, f"{title}. {alt}"), caption)
 
 
 def _ranking_picture(diagnosed: Found, _times: Times) -> Shown:
     title = _ranked(diagnosed.answer)
-    alt = f"{title}. Sigmas left by each cause that was fitted, best first."
-    caption = (
+    alt = tr("Sigmas left by each cause that was fitted, best first.")
+    caption = tr(
         "Each cause was fitted with its own size and course. The nearer to the dashed line, the"
         " better it explains the log; a look-alike is one that this log cannot reject."
     )
-    return Shown(title, draw_ranking(diagnosed, alt), caption)
+    return Shown(title, draw_ranking(diagnosed, f"{title}. {alt}"), caption)
 
 
 PICTURES: Mapping[str, Callable[[Found, Times], Shown]] = {
@@ -266,48 +283,71 @@ PICTURES: Mapping[str, Callable[[Found, Times], Shown]] = {
 
 
 def _verdict_in_numbers(answer: Answer) -> str:
-    rms = f"{change(answer, 'rms_mbar')} mbar rms"
+    rms = tr("{value} mbar rms", value=change(answer, "rms_mbar"))
     if not answer["causes"]:
-        fits = answer["verdict"] == "consistent"
-        by = "the mechanism" if mechanism_of(answer) else "a term from data"
-        term = f" with {by}" if extended(answer) else ""
-        return f"The twin as it stands {'fits' if fits else 'does not fit'}: {rms}{term}"
-    causes = listed([sized(cause) for cause in answer["causes"]])
-    is_single = len(answer["causes"]) == 1
-    does = "explains" if is_single else "explain"
-    if answer["verdict"] != "explained":
-        does += " only a part of"
-    return f"{causes[:1].upper()}{causes[1:]} {does} the deviation: {rms}"
+        if extended(answer):
+            term = tr("the mechanism") if mechanism_of(answer) else tr("a term from data")
+            rms = tr("{rms} with {term}", rms=rms, term=term)
+        if answer["verdict"] == "consistent":
+            return tr("The twin as it stands fits: {rms}", rms=rms)
+        return tr("The twin as it stands does not fit: {rms}", rms=rms)
+    count = len(answer["causes"])
+    causes = capital(listed([sized(cause) for cause in answer["causes"]]))
+    if answer["verdict"] == "explained":
+        return ntr(
+            "{causes} explains the deviation: {rms}",
+            "{causes} explain the deviation: {rms}",
+            count,
+            causes=causes,
+            rms=rms,
+        )
+    return ntr(
+        "{causes} explains only a part of the deviation: {rms}",
+        "{causes} explain only a part of the deviation: {rms}",
+        count,
+        causes=causes,
+        rms=rms,
+    )
 
 
 def _which(diagnosed: Found, laid: Laid) -> str:
-    which = (
-        "held out from the fit"
-        if set(laid.cycles.tolist()) <= set(diagnosed.held_out)
-        else "fitted"
-    )
-    return f"{which}, with the cause at work" if diagnosed.causes else which
+    if set(laid.cycles.tolist()) <= set(diagnosed.held_out):
+        which = tr("held out from the fit")
+    else:
+        which = tr("fitted")
+    return tr("{cycles}, with the cause at work", cycles=which) if diagnosed.causes else which
 
 
 def _where(diagnosed: Found, laid: Laid) -> str:
     if diagnosed.answer["verdict"] == "consistent":
-        return "Every phase is as in healthy cycles"
+        return tr("Every phase is as in healthy cycles")
     kind, before, after = worst_kind(diagnosed, laid)
     rms = f"{number(before)} → {number(after)}" if diagnosed.extended else number(before)
-    return f"The deviation is largest in {spoken(kind)}: {rms} mbar rms in the mean"
+    return tr(
+        "The deviation is largest in {phase}: {rms} mbar rms in the mean",
+        phase=spoken(kind),
+        rms=rms,
+    )
 
 
 def _ranked(answer: Answer) -> str:
     if not answer["causes"]:
-        return "No listed cause is worth naming"
+        return tr("No listed cause is worth naming")
     for cause in answer["causes"]:
         if cause["not_separable_from"]:
-            rivals = listed([spoken(name) for name in cause["not_separable_from"]], "or")
-            return f"This log cannot tell {spoken(cause['effect'])} from {rivals}"
-    name = listed([spoken(cause["effect"]) for cause in answer["causes"]])
-    leave = "leaves" if len(answer["causes"]) == 1 else "leave"
-    yet = "" if answer["verdict"] == "explained" else ", but more than healthy cycles have"
-    return f"{name.capitalize()} {leave} least{yet}"
+            rivals = listed([spoken(name) for name in cause["not_separable_from"]], tr("or"))
+            name = spoken(cause["effect"])
+            return tr("This log cannot tell {cause} from {rivals}", cause=name, rivals=rivals)
+    causes = capital(listed([spoken(cause["effect"]) for cause in answer["causes"]]))
+    count = len(answer["causes"])
+    if answer["verdict"] == "explained":
+        return ntr("{causes} leaves least", "{causes} leave least", count, causes=causes)
+    return ntr(
+        "{causes} leaves least, but more than healthy cycles have",
+        "{causes} leave least, but more than healthy cycles have",
+        count,
+        causes=causes,
+    )
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -315,18 +355,21 @@ def _ranked(answer: Answer) -> str:
 
 def _tables(answer: Answer, times: Times) -> Iterator[str]:
     if answer["causes"]:
-        head = ("cause", "course", "parameter", "value", "95 % from", "to", "unit")
-        yield page.table("Causes", head, _parameters(answer, times), numbers=(3, 4, 5))
+        head = [tr("cause"), tr("course"), tr("parameter"), tr("value")]
+        head += [tr("95 % from"), tr("to"), tr("unit")]
+        yield page.table(tr("Causes"), head, _parameters(answer, times), numbers=(3, 4, 5))
     yield _gain_table(answer)
     if answer["runners_up"]:
-        columns = ("effect", "course", "leftover (sigma)")
-        yield page.table("Runners-up, each alone", columns, _runners_up(answer), numbers=(2,))
+        caption = tr("Runners-up, each alone")
+        columns = (tr("effect"), tr("course"), tr("leftover (sigma)"))
+        yield page.table(caption, columns, _runners_up(answer), numbers=(2,))
     yield page.pairs(_cycles(answer))
 
 
 def _runners_up(answer: Answer) -> Iterator[tuple[str, ...]]:
     for runner_up in answer["runners_up"]:
-        yield spoken(runner_up["effect"]), runner_up["course"], number(runner_up["leftover_sigma"])
+        course = spoken(runner_up["course"])
+        yield spoken(runner_up["effect"]), course, number(runner_up["leftover_sigma"])
 
 
 def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
@@ -337,53 +380,55 @@ def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
             yield spoken(cause["effect"]), course, spoken(name), *numbers, p["unit"]
             if cause["course"] == Course.RAMP:
                 numbers = [number(p["at_end"]), "", ""]
-                name_at_end = f"{spoken(name)} at the end"
+                name_at_end = tr("{parameter} at the end", parameter=spoken(name))
                 yield "", "", name_at_end, *numbers, p["unit"].removesuffix("/h")
 
 
 def _gain_table(answer: Answer) -> str:
     """The figures on held-out cycles, before and, with an extended model, after."""
-    columns, caption = {"baseline": "twin as it stands"}, "Held-out cycles"
+    columns, caption = {"baseline": tr("twin as it stands")}, tr("Held-out cycles")
     if extended(answer):
-        columns, caption = {"baseline": "before", "extended": "after"}, "Gain on held-out cycles"
+        columns = {"baseline": tr("before"), "extended": tr("after")}
+        caption = tr("Gain on held-out cycles")
     rows: list[tuple[str, ...]] = [
-        (name, *(number(answer[column][key]) for column in columns), unit)
+        (tr(name), *(number(answer[column][key]) for column in columns), tr(unit))
         for key, name, _, unit in FIGURES
     ]
     if extended(answer):
         rows += _gained(answer)
-    head = ("", *columns.values(), "unit")
+    head = ("", *columns.values(), tr("unit"))
     return page.table(caption, head, rows, range(1, 1 + len(columns)))
 
 
 def _gained(answer: Answer) -> Iterator[tuple[str, ...]]:
     gain = answer["gain"]
-    yield "less rms deviation", "", number(gain["rms_reduction_pct"]), "%"
-    interval = gain_interval(gain, len(answer["cycles"]["held_out"]), "held-out cycle")
-    yield "how sure", "", interval, "%" if gain["low95"] is not None else ""
-    yield "share of what can be gained", "", number(gain["share_of_achievable_pct"]), "%"
+    yield tr("less rms deviation"), "", number(gain["rms_reduction_pct"]), "%"
+    interval = gain_interval(gain, len(answer["cycles"]["held_out"]))
+    yield tr("how sure"), "", interval, "%" if gain["low95"] is not None else ""
+    yield tr("share of what can be gained"), "", number(gain["share_of_achievable_pct"]), "%"
 
 
 def _cycles(answer: Answer) -> list[tuple[str, str]]:
     cycles = answer["cycles"]
-    rows = [("cycles complete in the log", str(cycles["total"]))]
+    rows = [(tr("cycles complete in the log"), str(cycles["total"]))]
     if cycles["fitted"]:
-        rows.append(("fitted on", some(cycles["fitted"])))
-        rows.append(("held out, to judge by", held_out_cycles(answer)))
+        rows.append((tr("fitted on"), some(cycles["fitted"])))
+        rows.append((tr("held out, to judge by"), held_out_cycles(answer)))
     return rows
 
 
 def _footer(diagnosis: Diagnosis, times: Times) -> str:
     answer = diagnosis.json
     rows = [
-        ("asset", f"{answer['asset']['type']} {answer['asset']['id']}"),
-        ("log", answer["log"]),
-        ("data set", f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
-        ("program", f"ejector-twin {version('ejector-twin')}"),
+        (tr("asset"), f"{answer['asset']['type']} {answer['asset']['id']}"),
+        (tr("log"), answer["log"]),
+        (tr("data set"), f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
+        (tr("program"), f"ejector-twin {version('ejector-twin')}"),
     ]
     if times.log_begin_ns is not None and times.now_ns is not None:
-        between = f"{dated(times.log_begin_ns)} to {dated(times.now_ns)}"
-        rows.insert(2, ("recorded", f"{between}; ages count back from its end"))
+        begin, end = dated(times.log_begin_ns), dated(times.now_ns)
+        between = tr("{begin} to {end}; ages count back from its end", begin=begin, end=end)
+        rows.insert(2, (tr("recorded"), between))
     return page.pairs(rows)
 
 
@@ -391,10 +436,10 @@ def _data_set(theta: Theta) -> str:
     """Calibrated values that a nameplate or a setting shows."""
     volume = theta[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]].sum()
     numbers = (
-        ("suction capacity", theta[c.SUCTION] / SL_MIN, "sl/min"),
-        ("volume", volume / ML, "ml"),
-        ("supply", theta[c.SUPPLY] / BAR, "bar"),
-        ("ambient", theta[c.AMBIENT] / MBAR, "mbar"),
+        (tr("suction capacity"), theta[c.SUCTION] / SL_MIN, "sl/min"),
+        (tr("volume"), volume / ML, "ml"),
+        (tr("supply"), theta[c.SUPPLY] / BAR, "bar"),
+        (tr("ambient"), theta[c.AMBIENT] / MBAR, "mbar"),
         ("H1", theta[c.H1] / MBAR, "mbar"),
     )
-    return ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in numbers)
+    return ", ".join(f"{name} {numeral(value, '.4g')} {unit}" for name, value, unit in numbers)

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.diagnosis.retelling import retold
 from twin.figures.money import Interval, interval_text, significant
 from twin.instants import SECOND_NS, dated, instant
-from twin.language import tr
+from twin.language import ntr, numeral, tr
 from twin.model.courses import Course
 from twin.model.effects import effect_of
 
@@ -17,7 +18,6 @@ Answer = Mapping[str, Any]
 MOST_LISTED = 12  # cycles listed by number
 MOST_FINER = 3  # extra digits at most, to tell the ends of an interval apart
 LONG_S = 120.0  # from here on times are in minutes
-COUNTED = ("No", "One", "Two", "Three")
 
 # Key in the answer, name, short name, unit.
 FIGURES = (
@@ -29,7 +29,7 @@ FIGURES = (
     ("leftover_sigma", "leftover (healthy: about 1)", "leftover", "sigma"),
 )
 # Properties of a course that are read from held-out cycles as well, since no other cycle has them.
-_READ_FROM_ALL = {Course.STEP: "when it began", Course.INTERMITTENT: "in which it acts"}
+READ_FROM_ALL = {Course.STEP: "when it began", Course.INTERMITTENT: "in which it acts"}
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Times:
 
     def at(self, seconds: float) -> str:
         """A time in the log: its clock time and age, and how far into the log."""
-        into = f"{clock(seconds)} into the log"
+        into = tr("{time} into the log", time=clock(seconds))
         if self.log_begin_ns is None:
             return into
         ns = self.log_begin_ns + round(seconds * SECOND_NS)
@@ -83,10 +83,14 @@ def headline(answer: Answer, now_ns: int) -> str:
     match answer["verdict"]:
         case "consistent":
             rms = number(answer["baseline"]["rms_mbar"])
-            return f"The ejector does what its twin expects; {rms} mbar rms left over are healthy."
+            return tr(
+                "The ejector does what its twin expects; {rms} mbar rms left over are healthy.",
+                rms=rms,
+            )
         case "explained" if len(causes) == 1:
             (cause,) = causes
-            return f"{effect_of(cause['effect']).sentence} – {size(cause)}, {when(cause, times)}."
+            sentence = tr(effect_of(cause["effect"]).sentence)
+            return f"{sentence} – {size(cause)}, {when(cause, times)}."
         case "explained":
             sizes = (f"{size(cause)}, {when(cause, times)}" for cause in causes)
             names = (spoken(cause["effect"]) for cause in causes)
@@ -96,21 +100,31 @@ def headline(answer: Answer, now_ns: int) -> str:
                     for name, size_and_time in zip(names, sizes, strict=True)
                 ]
             )
-            return f"{COUNTED[len(causes)]} causes together: {named}."
+            return ntr(
+                "{count} cause: {named}.",
+                "{count} causes together: {named}.",
+                len(causes),
+                named=named,
+            )
         case "unlisted" if mechanism := mechanism_of(answer):
-            opening = f"{_known(causes)} {spoken(answer['unlisted']['where'])}"
-            return f"{opening}. What suits best: {_small(mechanism['sentence'])}."
+            opening = _unexplained(causes, spoken(answer["unlisted"]["where"]))
+            best = tr("What suits best: {sentence}.", sentence=retold(mechanism["sentence"]))
+            return f"{opening} {best}"
         case "unlisted":
-            return f"{_known(causes)} {left_over(answer)}."
-    return f"The log cannot answer: {answer['next_experiment']}."
+            return _unexplained(causes, left_over(answer))
+    return tr("The log cannot answer: {reason}.", reason=retold(answer["next_experiment"]))
 
 
-def _known(causes: Sequence[Answer]) -> str:
+def _unexplained(causes: Sequence[Answer], location: str) -> str:
     if not causes:
-        return "No listed cause explains the deviation in"
-    verb = "explains" if len(causes) == 1 else "explain"
-    named = listed([sized(cause) for cause in causes])
-    return f"{_capital(named)} {verb} a part; no listed cause explains what is left in"
+        return tr("No listed cause explains the deviation in {where}.", where=location)
+    return ntr(
+        "{causes} explains a part; no listed cause explains what is left in {where}.",
+        "{causes} explain a part; no listed cause explains what is left in {where}.",
+        len(causes),
+        causes=capital(listed([sized(cause) for cause in causes])),
+        where=location,
+    )
 
 
 def mechanism_of(answer: Answer) -> Answer | None:
@@ -120,19 +134,19 @@ def mechanism_of(answer: Answer) -> Answer | None:
     return mechanism
 
 
-def _mechanism(mechanism: Answer) -> Iterator[tuple[str, str]]:
+def mechanism_lines(mechanism: Answer) -> Iterator[tuple[str, str]]:
     """Labelled lines on a mechanism."""
-    yield "mechanism", mechanism["sentence"]
-    yield "in the model", mechanism["formula"]
-    yield "sizes", "; ".join(_sizes(mechanism))
+    yield tr("mechanism"), retold(mechanism["sentence"])
+    yield tr("in the model"), retold(mechanism["formula"])
+    yield tr("sizes"), "; ".join(_sizes(mechanism))
     for rival in mechanism["not_separable_from"]:
-        yield "or it may be", rival
+        yield tr("or it may be"), retold(rival)
 
 
 def left_over(answer: Answer) -> str:
     """Where something unlisted acts, and its shape."""
     unlisted = answer["unlisted"]
-    return f"{spoken(unlisted['where'])}: {unlisted['shape']}"
+    return f"{spoken(unlisted['where'])}: {retold(unlisted['shape'])}"
 
 
 def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
@@ -173,38 +187,57 @@ def on_another_log(answer: Answer, nothing: str) -> str:
 def held_out_cycles(answer: Answer) -> str:
     """The held-out cycles, and which properties of causes were read from them as well."""
     courses = {cause["course"] for cause in answer["causes"]}
-    read = [reading for course, reading in _READ_FROM_ALL.items() if str(course) in courses]
-    exception = f", but for {listed(read)}, read from all" if read else ""
-    return some(answer["cycles"]["held_out"]) + exception
+    read = [reading for course, reading in READ_FROM_ALL.items() if str(course) in courses]
+    cycles = some(answer["cycles"]["held_out"])
+    if not read:
+        return cycles
+    exceptions = listed([tr(reading) for reading in read])
+    return tr("{cycles}, but for {what}, read from all", cycles=cycles, what=exceptions)
 
 
 def about(cause: Answer, times: Times, *, sure: bool) -> Iterator[tuple[str, str]]:
     """Labelled lines on one cause: size, course, certainty, cost and where to look."""
-    yield "cause" if sure else "a part of it", spoken(cause["effect"])
-    yield "size", "; ".join(_sizes(cause))
-    yield "when", when(cause, times, interval=True)
+    yield tr("cause") if sure else tr("a part of it"), spoken(cause["effect"])
+    yield tr("size"), "; ".join(_sizes(cause))
+    yield tr("when"), when(cause, times, interval=True)
     if sure:
-        yield "how sure", certainty(cause)
+        yield tr("how sure"), certainty(cause)
     if "cost" in cause:
-        yield "cost", cost(cause)
-    yield "look at", effect_of(cause["effect"]).look_at
+        yield tr("cost"), cost(cause)
+    yield tr("look at"), tr(effect_of(cause["effect"]).look_at)
     for name in cause["not_separable_from"]:
-        yield "or it may be", f"{spoken(name)}; then look at {effect_of(name).look_at}"
+        look_at = tr(effect_of(name).look_at)
+        yield (
+            tr("or it may be"),
+            tr("{cause}; then look at {where}", cause=spoken(name), where=look_at),
+        )
 
 
 def to_do(answer: Answer) -> Iterator[tuple[str, str]]:
     """What to find out and to record next."""
     if mechanism := mechanism_of(answer):
-        yield from _mechanism(mechanism)
-    if answer["verdict"] == "unlisted":
-        where, depends = spoken(answer["unlisted"]["where"]), answer["unlisted"]["depends_on"]
-        yield "find out", f"what in {where} differs from when the twin was calibrated"
-        if depends:
-            yield "it depends on", listed([spoken(quantity) for quantity in depends])
+        yield from mechanism_lines(mechanism)
+    yield from to_find_out(answer)
+    yield from to_record(answer)
+
+
+def to_find_out(answer: Answer) -> Iterator[tuple[str, str]]:
+    """What to find out about something unlisted."""
+    if answer["verdict"] != "unlisted":
+        return
+    where, depends = spoken(answer["unlisted"]["where"]), answer["unlisted"]["depends_on"]
+    what = tr("what in {where} differs from when the twin was calibrated", where=where)
+    yield tr("find out"), what
+    if depends:
+        yield tr("it depends on"), listed([spoken(quantity) for quantity in depends])
+
+
+def to_record(answer: Answer) -> Iterator[tuple[str, str]]:
+    """What to record next."""
     if answer["verdict"] == "insufficient":
-        yield "next", "put this right, record again and diagnose the new log"
+        yield tr("next"), tr("put this right, record again and diagnose the new log")
     elif answer["next_experiment"]:
-        yield "next recording", answer["next_experiment"]
+        yield tr("next recording"), retold(answer["next_experiment"])
 
 
 # --- one cause ------------------------------------------------------------------------------------
@@ -227,38 +260,42 @@ def size(cause: Answer) -> str:
 
 def _sizes(cause: Answer) -> Iterator[str]:
     for name, p in cause["parameters"].items():
-        grown = ""
-        if "at_end" in p:
-            grown = f"{number(p['at_end'])} {p['unit'].removesuffix('/h')} by the end, growing by "
         low, high = ends(p["low95"], p["high95"])
-        yield f"{spoken(name)} {grown}{number(p['value'])} {p['unit']} (95 %: {low} to {high})"
+        value = f"{number(p['value'])} {p['unit']}"
+        text = tr("{value} (95 %: {low} to {high})", value=value, low=low, high=high)
+        if "at_end" in p:
+            at_end = f"{number(p['at_end'])} {p['unit'].removesuffix('/h')}"
+            text = tr("{value} by the end, growing by {rate}", value=at_end, rate=text)
+        yield f"{spoken(name)} {text}"
 
 
 def when(cause: Answer, times: Times, *, interval: bool = False) -> str:
     """When a cause acts; with ``interval`` also that of its onset, and its cycles."""
     match Course(cause["course"]):
         case Course.STEP:
-            low, high = _clocks(cause["onset_low95_s"], cause["onset_high95_s"])
-            ends_text = f" (95 %: {low} to {high})" if interval else ""
-            return f"since {times.at(cause['onset_s'])}{ends_text}"
+            text = tr("since {time}", time=times.at(cause["onset_s"]))
+            if interval:
+                low, high = _clocks(cause["onset_low95_s"], cause["onset_high95_s"])
+                text = tr("{value} (95 %: {low} to {high})", value=text, low=low, high=high)
         case Course.RAMP if cause["onset_s"] > times.begin_s:
-            return f"growing since {times.at(cause['onset_s'])}"
+            text = tr("growing since {time}", time=times.at(cause["onset_s"]))
+        case Course.RAMP if times.begin_s > 0.0:
+            text = tr("growing since {time}, or longer", time=times.at(times.begin_s))
         case Course.RAMP:
-            return f"growing {_all_of_it(times, 'from the beginning of the log')}"
+            text = tr("growing from the beginning of the log")
         case Course.INTERMITTENT:
-            which = f": {some(cause['cycles'])}" if interval else ""
-            return f"in {number(cause['share_pct'])} % of the cycles{which}"
-    return _all_of_it(times, "in all of the log")
-
-
-def _all_of_it(times: Times, otherwise: str) -> str:
-    """When a cause acts that is present throughout: ``otherwise`` if the whole log is diagnosed."""
-    return f"since {times.at(times.begin_s)}, or longer" if times.begin_s > 0.0 else otherwise
+            text = tr("in {share} % of the cycles", share=number(cause["share_pct"]))
+            text += f": {some(cause['cycles'])}" if interval else ""
+        case _ if times.begin_s > 0.0:  # throughout, and only a part of the log is diagnosed
+            text = tr("since {time}, or longer", time=times.at(times.begin_s))
+        case _:
+            text = tr("in all of the log")
+    return text
 
 
 def certainty(cause: Answer) -> str:
     """Probability of a cause, compared with its look-alikes and something unlisted."""
-    alike = listed([tr(spoken(name)) for name in cause["not_separable_from"]], tr("or"))
+    alike = listed([spoken(name) for name in cause["not_separable_from"]], tr("or"))
     percent = f"{100.0 * cause['probability']:.0f} %"
     if not alike:
         return tr("{percent}; no other listed cause fits as well", percent=percent)
@@ -269,14 +306,20 @@ def cost(cause: Answer) -> str:
     """Cost of a cause a year, or that it cannot be told from zero; needs a configured price."""
     entry, name = cause["cost"], spoken(cause["effect"])
     money = Interval(**entry["money_per_year"])
-    basis = f"{entry['operating_hours']:g} h of operation"
+    hours = tr("{hours} h of operation", hours=numeral(entry["operating_hours"], "g"))
     if not entry["differs_from_zero"]:
         text = interval_text(money, entry["currency"])
-        return f"what this {name} costs cannot be told from zero: {text}, {basis}"
-    if money.value > 0.0:
-        return f"this {name} costs about {interval_text(money, entry['currency'])}, {basis}"
-    saving = Interval(-money.value, -money.high95, -money.low95)
-    return f"this {name} takes less air: about {interval_text(saving, entry['currency'])}, {basis}"
+        text = tr(
+            "what this {cause} costs cannot be told from zero: {amount}", cause=name, amount=text
+        )
+    elif money.value > 0.0:
+        text = interval_text(money, entry["currency"])
+        text = tr("this {cause} costs about {amount}", cause=name, amount=text)
+    else:
+        saving = Interval(-money.value, -money.high95, -money.low95)
+        text = interval_text(saving, entry["currency"])
+        text = tr("this {cause} takes less air: about {amount}", cause=name, amount=text)
+    return f"{text}, {hours}"
 
 
 # --- numbers and lists ----------------------------------------------------------------------------
@@ -296,20 +339,26 @@ def extended(answer: Answer) -> bool:
 def gain(answer: Answer) -> str:
     """Reduction of the deviation with its interval, and its share of the achievable gain."""
     figures = answer["gain"]
-    held_out = len(answer["cycles"]["held_out"])
-    interval = gain_interval(figures, held_out, "held-out cycle")
-    reduction = f"{number(figures['rms_reduction_pct'])} % less rms deviation ({interval})"
-    return f"{reduction}, {number(figures['share_of_achievable_pct'])} % of what can be gained"
+    return tr(
+        "{reduction} % less rms deviation ({interval}), {share} % of what can be gained",
+        reduction=number(figures["rms_reduction_pct"]),
+        interval=gain_interval(figures, len(answer["cycles"]["held_out"])),
+        share=number(figures["share_of_achievable_pct"]),
+    )
 
 
-def gain_interval(figures: Answer, cycles: int, cycle: str = "cycle") -> str:
+def gain_interval(figures: Answer, cycles: int) -> str:
     """The 95 % interval of a gain on ``cycles`` cycles, or why there is none."""
     if figures["low95"] is not None:
         low, high = ends(figures["low95"], figures["high95"])
-        return f"95 %: {low} to {high}"
+        return tr("95 %: {low} to {high}", low=low, high=high)
     if figures["rms_reduction_pct"] == 0.0:
-        return "no cause changes the pressure between switchings"
-    return f"{cycles} {cycle}{'s' * (cycles != 1)} cannot tell how sure that is"
+        return tr("no cause changes the pressure between switchings")
+    return ntr(
+        "{count} held-out cycle cannot tell how sure that is",
+        "{count} held-out cycles cannot tell how sure that is",
+        cycles,
+    )
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -325,9 +374,9 @@ def ends(low: float, high: float) -> tuple[str, str]:
 def clock(seconds: float, finer: int = 0) -> str:
     """A time in the log, with ``finer`` extra decimals."""
     if seconds < LONG_S:
-        return f"{seconds:.{1 + finer}f} s"
+        return f"{numeral(seconds, f'.{1 + finer}f')} s"
     minutes, rest = divmod(round(seconds, finer), 60)
-    return f"{minutes:.0f} min {rest:.{finer}f} s"
+    return f"{minutes:.0f} min {numeral(rest, f'.{finer}f')} s"
 
 
 def _clocks(low: float, high: float) -> tuple[str, str]:
@@ -344,23 +393,27 @@ def some(cycles: Sequence[int]) -> str:
     """Numbers of cycles; shortened if they are more than MOST_LISTED."""
     if len(cycles) <= MOST_LISTED:
         return ", ".join(map(str, cycles))
-    return f"{', '.join(map(str, cycles[:3]))} … {cycles[-1]} ({len(cycles)} cycles)"
+    counted = ntr("{count} cycle", "{count} cycles", len(cycles))
+    return f"{', '.join(map(str, cycles[:3]))} … {cycles[-1]} ({counted})"
 
 
-def listed(parts: Sequence[str], last: str = "and") -> str:
-    """A list in words, with ``last`` before its last part."""
+def listed(parts: Sequence[str], last: str = "") -> str:
+    """A list in words, with ``last`` (by default "and") before its last part."""
     *first, end = parts or [""]
-    return f"{', '.join(first)} {last} {end}" if first else end
+    word = last or tr("and")
+    return f"{', '.join(first)} {word} {end}" if first else end
 
 
 def spoken(name: str) -> str:
-    """A name in words."""
+    """A name in words of the chosen language."""
+    return tr(plain_words(name))
+
+
+def plain_words(name: str) -> str:
+    """A name in English words."""
     return name.replace("blow_off", "blow-off").replace("_", " ")
 
 
-def _small(text: str) -> str:
-    return text[:1].lower() + text[1:]
-
-
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
+    """A text that begins with a capital letter."""
     return text[:1].upper() + text[1:]

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from twin.language import numeral, tr
+
 EXACT_FROM = 10.0  # of a currency: amounts from here on have no decimals
 NOTHING = 1e-9  # of a currency: smaller amounts are rounding errors of zero
 
@@ -31,16 +33,17 @@ def amount(money: float) -> str:
     if abs(money) < NOTHING:
         return "0"
     if abs(money) < 0.1:
-        return f"{money:.2g}"
-    return f"{money:.0f}" if abs(money) >= EXACT_FROM else f"{money:.2f}"
+        return numeral(money, ".2g")
+    return numeral(money, ".0f" if abs(money) >= EXACT_FROM else ".2f")
 
 
 def significant(value: float, digits: int = 3) -> str:
     """A number with ``digits`` significant digits, without an exponent."""
-    return f"{float(f'{value:.{digits}g}'):.10g}"
+    return numeral(float(f"{value:.{digits}g}"), ".10g")
 
 
 def interval_text(money: Interval, currency: str) -> str:
     """An amount with its 95 % interval: "145 € a year (95 %: 110 to 180)"."""
     low, high = amount(money.low95), amount(money.high95)
-    return f"{amount(money.value)} {currency} a year (95 %: {low} to {high})"
+    value = f"{amount(money.value)} {currency}"
+    return tr("{amount} a year (95 %: {low} to {high})", amount=value, low=low, high=high)

@@ -11,7 +11,7 @@ from twin.figures.settings import Limits
 from twin.figures.table import FIGURES, Figure
 from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, Trend, trend_of
 from twin.instants import clock, instant, lasting
-from twin.language import tr
+from twin.language import ntr, numeral, tr
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
 NO_SCATTER = 1e-6  # of the level: equal values give no interval
@@ -130,8 +130,13 @@ def course_in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
     unit = NO_DASH.get(figure.unit, f" {figure.unit}")
     texts = []
     if trend.lacking:
-        last = {"at": instant(trend.end_ns, now_ns), "count": trend.lacking}
-        texts.append(tr("last measured at {at}, and not in the {count} cycles since", **last))
+        last = ntr(
+            "last measured at {at}, and not in the cycle since",
+            "last measured at {at}, and not in the {count} cycles since",
+            trend.lacking,
+            at=instant(trend.end_ns, now_ns),
+        )
+        texts.append(last)
     if (step := trend.step) is not None:
         texts.append(_stepped(step, unit, now_ns))
     if (line := trend.line) is not None:
@@ -140,13 +145,17 @@ def course_in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
     elif step is None and not trend.lacking:
         return tr("not enough to say: fewer than {count} stretches with cycles", count=FEWEST_BINS)
     if trend.limit is not None:
-        texts.append(_limited(trend, tr("its limit of {value}", value=f"{trend.limit:.4g}{unit}")))
+        texts.append(
+            _limited(
+                trend, tr("its limit of {value}", value=f"{numeral(trend.limit, '.4g')}{unit}")
+            )
+        )
     return "; ".join(filter(None, texts))
 
 
 def _stepped(step: Step, unit: str, now_ns: int) -> str:
     before, after = (
-        f"{level:.4g}{_give_or_take(half, level)}"
+        f"{numeral(level, '.4g')}{_give_or_take(half, level)}"
         for level, half in ((step.before, step.before_half), (step.after, step.after_half))
     )
     return tr(
@@ -168,7 +177,7 @@ def _runs(line: Line, unit: str, *, since: bool) -> str:
         text = tr("no trend since then ({change})", change=change)
     else:
         text = tr("no trend ({change})", change=change)
-    return text if since else f"{line.level:.4g}{unit}, {text}"
+    return text if since else f"{numeral(line.level, '.4g')}{unit}, {text}"
 
 
 def _ran(line: Line, unit: str, *, since: bool) -> str:
@@ -176,7 +185,7 @@ def _ran(line: Line, unit: str, *, since: bool) -> str:
 
     Without a trend it says nothing: "no trend" would sound as if all were well.
     """
-    level = "" if since else f"{line.level:.4g}{unit}"
+    level = "" if since else f"{numeral(line.level, '.4g')}{unit}"
     change = _changes(line, unit) if line.is_trend else ""
     if change and since:
         change = tr("{change} after that", change=change)
@@ -186,7 +195,8 @@ def _ran(line: Line, unit: str, *, since: bool) -> str:
 def _changes(line: Line, unit: str) -> str:
     """Change of a line per day, or over a shorter record."""
     span = 1.0 if line.is_rate else line.span
-    change = f"{line.slope * span:+.3g}{_give_or_take(line.slope_half() * span, line.level)}"
+    change = numeral(line.slope * span, "+.3g")
+    change += _give_or_take(line.slope_half() * span, line.level)
     values = {"change": f"{change}{unit}", "time": lasting(line.span * 86_400.0)}
     if line.is_rate:
         return tr("{change} per day over {time}", **values)
@@ -195,7 +205,7 @@ def _changes(line: Line, unit: str) -> str:
 
 def _give_or_take(half: float, level: float) -> str:
     """Half of an interval in words; empty if the record shows no scatter."""
-    return f" ± {half:.2g}" if half > NO_SCATTER * max(abs(level), 1.0) else ""
+    return f" ± {numeral(half, '.2g')}" if half > NO_SCATTER * max(abs(level), 1.0) else ""
 
 
 def _limited(trend: Trend, limit: str) -> str:
@@ -214,14 +224,14 @@ def _comes(comes: Reach | None, line: Line, limit: str) -> str:
     if comes is None:
         return tr("away from {limit}", limit=limit)
     if not math.isfinite(comes.expected):
-        days = f"{FARTHEST * line.span:.1f}"
+        days = numeral(FARTHEST * line.span, ".1f")
         return tr("{limit} is more than {days} days away", limit=limit, days=days)
     return tr(
         "{limit} in {days} days ({earliest} to {latest})",
         limit=limit,
-        days=f"{comes.expected:.1f}",
-        earliest=f"{comes.earliest:.1f}",
-        latest=f"{comes.latest:.1f}" if math.isfinite(comes.latest) else tr("never"),
+        days=numeral(comes.expected, ".1f"),
+        earliest=numeral(comes.earliest, ".1f"),
+        latest=numeral(comes.latest, ".1f") if math.isfinite(comes.latest) else tr("never"),
     )
 
 

@@ -14,6 +14,7 @@ from twin.fleet.peers import FEWEST_PEERS, Drift
 from twin.fleet.report import STANDS_OUT, Report, Row, State
 from twin.fleet.type_statistics import Estimate
 from twin.instants import dated
+from twin.language import ENGLISH
 
 MOST_LISTED = 15  # units, in the terminal
 GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"
@@ -96,6 +97,7 @@ def write_page(report: Report, path: Path) -> None:
         else (GOOD, "✓")
     )
     page = PAGE.substitute(
+        language=ENGLISH.code,
         title="Fleet",
         colour=colour,
         mark=mark,

@@ -6,9 +6,9 @@ from typing import Any
 
 from twin.alarms.rules import Rule
 from twin.alarms.text import action_of
-from twin.errors import ConfigError, known_names
-from twin.extras import install_hint
-from twin.language import Texts, speaking, tr
+from twin.instants import DATE, TIME
+from twin.language import ENGLISH, Language, ntr, speaking, tr
+from twin.languages import language_of
 from twin.notifications.escalation import Reason
 from twin.notifications.mail_server import Letter
 from twin.notifications.message import ns_of
@@ -18,10 +18,9 @@ from twin.page.ejector_status import describe_alarm, facts, priority_words, stat
 from twin.settings import Document
 
 Body = Mapping[str, Any]
-ENGLISH = "en"
 
 
-def writer(rules: Sequence[Rule], texts: Texts) -> Callable[[Body], Letter]:
+def writer(rules: Sequence[Rule], language: Language) -> Callable[[Body], Letter]:
     """A function that writes mails of ``twin.notifications.escalation`` in one language.
 
     ``rules`` are those in use. An alarm whose rule is gone is told in the words of its message.
@@ -30,35 +29,18 @@ def writer(rules: Sequence[Rule], texts: Texts) -> Callable[[Body], Letter]:
 
     def write(mail: Body) -> Letter:
         rule = by_name.get(mail["document"]["alarm"])
-        with speaking(texts):
+        with speaking(language):
             subject, text = _subject(mail, rule), "\n".join(_lines(mail, rule)) + "\n"
         return Letter(mail["name"], mail["address"], subject, text)
 
     return write
 
 
-def texts_of(document: Document) -> Texts:
-    """The texts of the e-mail's language in a configuration.
-
-    ConfigError if there is no such catalogue, or if its reader is not installed.
-    """
+def mail_language(document: Document) -> Language:
+    """The language of e-mails in a configuration; ConfigError if there are no texts in it."""
     settings = chosen_notifications(document)
-    language = settings.email.language if settings else ENGLISH
-    if language == ENGLISH:
-        return {}
-    key = f"{document.name}: [notifications.email] language"
-    try:
-        from twin.page.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
-    except ImportError as error:
-        raise ConfigError(
-            f'{key} "{language}" needs a package that is not installed', install_hint("serve")
-        ) from error
-    catalogues = Catalogues().texts
-    if language not in catalogues:
-        raise ConfigError(
-            f'{key}: there are no texts in "{language}"', known_names(language, catalogues)
-        )
-    return catalogues[language]
+    code = settings.email.language if settings else ENGLISH.code
+    return language_of(code, f"{document.name}: [notifications.email] language")
 
 
 def _subject(mail: Body, rule: Rule | None) -> str:
@@ -74,7 +56,12 @@ def _subject(mail: Body, rule: Rule | None) -> str:
         case Reason.ESCALATED:
             return tr("Not acknowledged: {subject}", subject=subject)
         case Reason.REPEATED:
-            return tr("{count} times: {subject}", count=mail["count"], subject=subject)
+            return ntr(
+                "{count} time: {subject}",
+                "{count} times: {subject}",
+                mail["count"],
+                subject=subject,
+            )
     return subject
 
 
@@ -118,7 +105,8 @@ def _labelled(name: str, text: str) -> str:
 def _clock(instant: datetime) -> str:
     """Date, time and zone; a mail may be read much later, and elsewhere."""
     offset = instant.strftime("%z")
-    return f"{instant:%Y-%m-%d %H:%M:%S} (UTC{offset[:3]}:{offset[3:5]})"
+    local = instant.strftime(f"{tr(DATE)} {TIME}")
+    return f"{local} (UTC{offset[:3]}:{offset[3:5]})"
 
 
 def _why(mail: Body) -> str:
@@ -129,9 +117,10 @@ def _why(mail: Body) -> str:
         case Reason.ON_DUTY:
             return tr("You get this mail because the alarm stood when your duty began.")
         case Reason.REPEATED:
-            return tr(
+            return ntr(
+                "The alarm was raised {count} time in all. You get one mail for several times.",
                 "The alarm was raised {count} times in all. You get one mail for several times.",
-                count=mail["count"],
+                mail["count"],
             )
     return tr("You get this mail because the alarm was raised.")
 

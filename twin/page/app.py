@@ -34,10 +34,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from twin.alarms.state import Deed
 from twin.alarms.statistics import DAY_NS, in_words, statistics
 from twin.audit import Act
+from twin.catalogues import Catalogues
 from twin.errors import TwinError
 from twin.language import speaking, tr
 from twin.login import Authenticator
-from twin.page.catalogues import Catalogues
 from twin.page.ejector import Ejector
 from twin.page.plant_overview import PlantOverview
 from twin.page.plant_overview_app import ALL, AllEjectors
@@ -144,7 +144,7 @@ class Page:
         self._authenticator, self.users = authenticator, authenticator.users
         self._catalogues = Catalogues()
         self._states = [
-            {code: _CachedState(ejector.state) for code in self._catalogues.texts}
+            {code: _CachedState(ejector.state) for code in self._catalogues.languages}
             for ejector in ejectors
         ]
         self._login_lock = asyncio.Lock()  # one at a time: its hash takes memory and time
@@ -200,14 +200,25 @@ class Page:
     async def texts(self, request: Request) -> Response:
         """The texts of scripts in the reader's language."""
         code = request.scope["language"]
-        texts = json.dumps(dict(self._catalogues.texts[code]), ensure_ascii=False)
-        script = f"const LANGUAGE = {json.dumps(code)};\nconst TEXTS = {texts};\n"
+        language = self._catalogues.languages[code]
+        constants = {
+            "LANGUAGE": code,
+            "TEXTS": dict(language.texts),
+            "DECIMAL": language.decimal,
+            "GROUP": language.group,
+        }
+        script = "".join(
+            f"const {name} = {json.dumps(value, ensure_ascii=False)};\n"
+            for name, value in constants.items()
+        )
+        # gettext writes the index of a plural form in C, which JavaScript reads as well.
+        script += f"const pluralForm = (n) => Number({self._catalogues.plural_expression(code)});\n"
         return Response(script, media_type="text/javascript")
 
     async def choose_language(self, request: Request) -> Response:
         """Store a chosen language in a cookie, and redirect to the previous page."""
         code = request.path_params["code"]
-        if code not in self._catalogues.texts:
+        if code not in self._catalogues.languages:
             raise HTTPException(HTTPStatus.NOT_FOUND)
         previous = urlsplit(request.headers.get("referer", "")).path
         target = previous if previous in (ALL, "/login") else "/"
@@ -362,7 +373,8 @@ class Page:
     async def report(self, request: Request) -> Response:
         """The HTML report of a diagnosis."""
         self._require_sight(request)
-        content = await run_sync(self._ejector(request).report, request.path_params["name"])
+        name, code = request.path_params["name"], request.scope["language"]
+        content = await run_sync(self._ejector(request).report, name, code)
         if content is None:
             raise HTTPException(HTTPStatus.NOT_FOUND, tr("this report is not kept any more"))
         return HTMLResponse(content, headers=REPORT_HEADERS)
@@ -609,7 +621,7 @@ class _Guard:
         accepted = connection.headers.get("accept-language", "")
         code = self._catalogues.choose(connection.cookies.get(LANGUAGE, ""), accepted)
         scope["language"] = code
-        with speaking(self._catalogues.texts[code]):
+        with speaking(self._catalogues.languages[code]):
             await self._app(scope, receive, _with_headers(send))
 
 

@@ -7,6 +7,7 @@ import math
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from twin.alarms.board import Board, Comment, Episode
@@ -27,6 +28,7 @@ from twin.figures.text import course_in_words, title_of, trend_of_figure
 from twin.figures.trend import DAY_NS, Trend
 from twin.instants import zone
 from twin.language import tr
+from twin.languages import translation_of
 from twin.page import ring
 from twin.page.bins import json_numbers
 from twin.page.curve import Curves, document_of
@@ -288,14 +290,15 @@ class Ejector:
 
     # --- reports --------------------------------------------------------------------------------
 
-    def report(self, name: str) -> bytes | None:
-        """The HTML report of a diagnosis; None if there is none of that name."""
+    def report(self, name: str, code: str) -> bytes | None:
+        """The HTML report of a diagnosis in a language, else in English; None without a report."""
         if not REPORT.fullmatch(name):
             return None
-        try:
-            return (self._folder / REPORTS / f"{name}.html").read_bytes()
-        except OSError:
-            return None
+        report = self._folder / REPORTS / f"{name}.html"
+        for file in (translation_of(report, code), report):
+            with suppress(OSError):
+                return file.read_bytes()
+        return None
 
     # --- the database ---------------------------------------------------------------------------
 

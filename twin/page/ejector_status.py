@@ -13,10 +13,11 @@ from twin.alarms.requests import Request
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Alarm, State
 from twin.alarms.text import action_of
-from twin.diagnosis.text import certainty, ends, number, spoken
+from twin.diagnosis.retelling import retold
+from twin.diagnosis.text import Times, capital, certainty, ends, number, plain_words, spoken, when
 from twin.figures.text import NO_DASH
 from twin.instants import instant, lasting
-from twin.language import is_english, tr
+from twin.language import ENGLISH, language_code, numeral, tr
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.monitor.healthy import NOT_COMMISSIONED
 
@@ -194,26 +195,22 @@ def describe_alarm(
 ) -> dict[str, Any]:
     """Title, sentence and place of an alarm; ``entry`` describes a catalogue's effect."""
     if entry:
-        heading, location = _title(spoken(entry["name"])), entry["look_at"].partition(":")[0]
+        heading, location = capital(spoken(entry["name"])), entry["look_at"].partition(":")[0]
         return {"what": heading, "sentence": f"{entry['sentence']}.", "where": location}
     cause = cause_of(value)
     if cause in EFFECTS:
         return {
-            "what": _title(tr(spoken(cause))),
+            "what": capital(spoken(cause)),
             "sentence": f"{tr(EFFECTS[cause].sentence)}.",
             "where": tr(EFFECTS[cause].look_at).partition(":")[0],
         }
     title = tr(WITHOUT[cause] if cause in WITHOUT else spelt(alarm))
-    return {"what": _title(title), "sentence": "", "where": ""}
+    return {"what": capital(title), "sentence": "", "where": ""}
 
 
 def spelt(alarm: str) -> str:
     """The name in words of an alarm without a cause."""
-    return " ".join(_UPPER_CASE.get(word, word) for word in spoken(alarm).split())
-
-
-def _title(words: str) -> str:
-    return words[:1].upper() + words[1:]
+    return " ".join(_UPPER_CASE.get(word, word) for word in plain_words(alarm).split())
 
 
 def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
@@ -224,20 +221,32 @@ def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     yield from ((tr("how sure"), text) for text in _sureness(evidence))
     if measured := _measured(evidence):
         yield tr("measured"), measured
-    if "words" in evidence:
-        yield tr("evidence") if is_english() else tr("evidence (English)"), str(evidence["words"])
+    if "log_begin_ns" in evidence and "course" in evidence:
+        times = Times(evidence.get("begin_s", 0.0), evidence["log_begin_ns"], None)
+        yield tr("when"), when(evidence, times, interval=True)
+    yield from _words(evidence)
     first, last = evidence.get("first_cycle"), evidence.get("last_cycle")
     if first is not None:
         cycles = f"{first}" if first == last else tr("{a} to {b}", a=first, b=last)
         yield tr("cycles"), cycles
 
 
+def _words(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+    """The sentence of the evidence; in other languages only if nothing else says the same."""
+    sentence = str(evidence.get("words", ""))
+    text = retold(sentence)
+    if text != sentence or (sentence and language_code() == ENGLISH.code):
+        yield tr("evidence"), text
+    elif sentence and not evidence.keys() & {"excess_mbar", "log_begin_ns"}:
+        yield tr("evidence (English)"), sentence
+
+
 def _measured(evidence: Mapping[str, Any]) -> str:
     """Measured and expected value in words; empty if the evidence has no numbers."""
     if "excess_mbar" in evidence:
-        phase = str(evidence.get("phase", "")).replace("_", "-")
-        excess = f"{evidence['excess_mbar']:+.1f}"
-        return tr("{phase}: {excess} mbar from healthy", phase=tr(phase), excess=excess)
+        phase = spoken(str(evidence.get("phase", "")))
+        excess = numeral(evidence["excess_mbar"], "+.1f")
+        return tr("{phase}: {excess} mbar from healthy", phase=phase, excess=excess)
     if evidence.get("measured") is None or evidence.get("expected") is None:
         return ""
     sides = {side: number(evidence[side]) for side in ("measured", "expected")}
@@ -259,7 +268,7 @@ def _sureness(evidence: Mapping[str, Any]) -> Iterable[str]:
         yield tr("diagnosed: {certainty}", certainty=certainty(evidence))
     elif "guess" in evidence:
         effects = str(evidence.get("also", "")).split(",")
-        names = [tr(spoken(effect)) for effect in effects if effect]
+        names = [spoken(effect) for effect in effects if effect]
         if names:
             rest = ", ".join(names)
             yield tr("a first guess, or {alike}; the diagnosis needs some more cycles", alike=rest)

@@ -16,7 +16,7 @@ from twin.figures.database import SIDES
 from twin.figures.table import FIGURES
 from twin.figures.text import title_of
 from twin.instants import SECOND_NS, instant, lasting, zone
-from twin.language import speaking, tr
+from twin.language import ENGLISH, speaking, tr
 from twin.page.ejector import figure_labels
 from twin.page.ejector_status import (
     WORST_FIRST,
@@ -169,7 +169,7 @@ def _advice(alarm: Document) -> dict[str, Any]:
     """Consequence and action; in the reader's language if the rule is the program's own."""
     rule = _RULES.get(str(alarm["alarm"]))
     advice = {key: alarm.get(key, "") for key in ("consequence", "action")}
-    with speaking({}):
+    with speaking(ENGLISH):
         published = {"consequence": rule.consequence, "action": action_of(rule, {})} if rule else {}
     if rule is None or advice != published:
         return advice

@@ -9,7 +9,14 @@ let zone = null; // seconds that the server's zone is ahead of UTC: all times ar
 
 // --- languages -----------------------------------------------------------------------------------
 
-const t = (text, values = {}) => (TEXTS[text] ?? text).replace(/\{(\w+)\}/g, (_, name) => values[name]);
+const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
+const t = (text, values = {}) => fill(TEXTS[text] ?? text, values);
+
+function tn(singular, plural, count, values = {}) { // the form of a text for a count
+  const forms = TEXTS[singular];
+  const text = forms ? forms[pluralForm(count)] : count === 1 ? singular : plural;
+  return fill(text, { count: number(count, 0), ...values });
+}
 
 function offerLanguages(languages) {
   $("language").replaceChildren(...languages.map(({ code, name }) => element(
@@ -48,7 +55,10 @@ function there(seconds) { // a date whose hours and days are those of the server
 function number(value, digits) {
   if (value === null) return "–";
   const text = value.toFixed(digits);
-  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
+  const sign = value < 0 && Number(text) !== 0 ? "−" : "";
+  const [whole, fraction] = text.replace("-", "").split(".");
+  const grouped = whole.length < 5 ? whole : whole.replace(/\B(?=(\d{3})+$)/g, GROUP);
+  return sign + grouped + (fraction ? DECIMAL + fraction : "");
 }
 
 const now = () => Date.now() / 1000 + skew;

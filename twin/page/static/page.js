@@ -46,8 +46,8 @@ function summary(state) {
   const quiet = state.alarms.length - standing;
   const parts = [];
   if (!state.running) parts.push(state.last ? t("since {time}", { time: state.last_seen }) : t("never yet"));
-  if (standing) parts.push(t("alarms: {count}", { count: standing }));
-  if (quiet) parts.push(t("shelved: {count}", { count: quiet }));
+  if (standing) parts.push(tn("{count} alarm", "{count} alarms", standing));
+  if (quiet) parts.push(tn("{count} shelved", "{count} shelved", quiet));
   return parts.join(", ") || t("no alarm");
 }
 

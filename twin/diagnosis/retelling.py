@@ -1,0 +1,188 @@
+"""Stored sentences in the reader's language.
+
+Answers and alarms are stored and exchanged in English, whoever reads them. A sentence with numbers
+in it is matched with the template that it was written from; the template's translation then takes
+its values. A sentence without a template stays English.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import cache
+
+from twin.figures.warnings import CAUTIONS
+from twin.language import ENGLISH, language_code, notation_within, tr
+from twin.model.mechanism import PLACES, WHENS, Place
+from twin.monitor.healthy import NOT_COMMISSIONED
+
+_BECAUSE = (  # why a log cannot answer
+    "the log has no complete cycle: record suction, blow-off and the idle after it",
+    "the pressure input is saturated in {share}% of the samples: check the sensor's range and"
+    " wiring, then record again",
+    "only {count} cycle can be judged: record at least {least} complete ones in a row",
+    "only {count} cycles can be judged: record at least {least} complete ones in a row",
+    "no row can be compared: the twin never found a state to start from",
+    f"{NOT_COMMISSIONED}; fit the twin first to a log of healthy cycles: {{command}}",
+    "{commands} derived from the pressure: {suctions}; {releases}; valve delays and the timing of"
+    " commands cannot be told: record the commands as well",
+    "releases go above the level of idle, so they are called blow-off",
+    "no release goes above the level of idle: whether a blow-off or a vent ends the vacuum cannot"
+    " be told, so it is called idle",
+    "{count} suction",
+    "{count} suctions",
+)
+_EXPERIMENTS = (  # what to record next
+    "record {test}: {causes} and {rivals} are predicted to part by {sigmas} sigma",
+    "no recording of this sensor is predicted to part {causes} from {rivals} (at most {sigmas}"
+    " sigma): measure one of them by other means",
+    "what else it may be",
+)
+_UNLISTED = (  # the shape of something unlisted
+    "another one in each cycle: no term of the model can take it away",
+    "up to {size} mbar of pressure, at {time} ms after it begins",
+    "up to {size} mbar of pressure, at {vacuum} mbar vacuum",
+    "no listed effect explains what is left in {phase}: {shape}",
+)
+_MECHANISMS = (
+    "{begin} ({sizes}), {when}",
+    "{what} changes by {size} times the share; {share}",
+    "{what} changes by {size} times the share; {what_2} changes by {size_2} times the share;"
+    " {share}",
+)
+_SIGNALS = (  # reported signals that contradict the pressure, and what to do
+    "the ejector reports its nozzle on while nothing is commanded",
+    "the pressure shows that the nozzle goes off at {level} of vacuum, and the ejector reports it"
+    " on",
+    "the ejector reports its nozzle off, and the vacuum goes on rising by {rise}",
+    "the ejector reports no part, though the vacuum passes H2, {level}",
+    "part present comes at {level} of vacuum; H2 is {h2}",
+    "at rest {sensor} reads {difference} more than the pressure",
+    "at rest {sensor} reads {difference} less than the pressure",
+    "the barometer",
+    "the second pressure",
+    "by the flow {metered} standard litres are drawn off until {level} of vacuum; the pressure"
+    " shows {shown}",
+    "check whether the bit of the tag means off, or saving air",
+    "check that the tag reads this ejector, and the right bit",
+    "check whether the nozzle's valve sticks, then what the tag reads",
+    "check which bit the tag part_present reads",
+    "set [data.ejector] h2_mbar = {value}, or H2 of the ejector",
+    "compare both with a third, then check the scale of the tag {tag}",
+    "check unit, scale and direction of the tag flow, then volumes in [data.system.parts]",
+)
+_ALARMS = (  # evidence of alarms
+    "no fresh sample for {time} ms: check PLC and network",
+    "pressure signal: {quality}",
+    "out of range",
+    "overflow",
+    "stale",
+    "bad",
+    "{warning}; expected {value}",
+    "set in [figures]",
+    "from the unit's data set",
+)
+_AS_WRITTEN = {"tag", "command"}  # values that a person types
+_SIZE = re.compile(r"([a-z][a-z0-9 ]*?) ([-+]?\d\S* \S+)")  # a name with its size
+
+
+def capitalised(place: Place) -> str:
+    """The sentence of a place as a mechanism's sentence begins with it."""
+    return place.sentence[:1].upper() + place.sentence[1:]
+
+
+def templates() -> list[str]:
+    """All templates of stored sentences; the catalogue has each of them."""
+    caution_words = [
+        re.sub(r"\{([^:}]+)[^}]*\}", lambda match: f"{{{_name_of(match[1])}}}", caution.words)
+        for caution in CAUTIONS.values()
+    ]
+    return [
+        *_BECAUSE,
+        *_EXPERIMENTS,
+        *_UNLISTED,
+        *_SIGNALS,
+        *_ALARMS,
+        *caution_words,
+        *(text for when in WHENS.values() for text in (when.sentence, when.formula)),
+        *map(capitalised, PLACES.values()),
+        *(word for place in PLACES.values() for word in place.words),
+        *_MECHANISMS,
+    ]
+
+
+def _name_of(field: str) -> str:
+    """The name of a value in a template, from that of a field such as ``limits.supply[0]``."""
+    return "_".join(re.findall(r"\w+", field))
+
+
+def retold(sentence: str) -> str:
+    """A stored English sentence in the chosen language; unchanged if it has no template."""
+    is_english = language_code() == ENGLISH.code
+    return sentence if is_english else _by_template(sentence) or sentence
+
+
+def _by_template(text: str) -> str:
+    """A text in the chosen language; empty if it has no template there."""
+    if (translated := tr(text)) != text:
+        return translated
+    for template, pattern in _patterns():
+        if match := pattern.fullmatch(text):
+            values = {
+                name: value if name in _AS_WRITTEN else _value(value)
+                for name, value in match.groupdict().items()
+            }
+            return tr(template, **values)
+    finding, _, action = text.partition(": ")
+    parts = [_by_template(part) for part in (finding, action) if part != text]
+    return ": ".join(parts) if len(parts) == 2 and all(parts) else ""
+
+
+def _value(text: str) -> str:
+    """A value of a template in the chosen language: a text, sizes, names or a number."""
+    return _by_template(text) or _each(text, _size) or _each(text, _name) or notation_within(text)
+
+
+@cache
+def _patterns() -> list[tuple[str, re.Pattern[str]]]:
+    """The templates that have values, the longest first, each with a pattern for these values."""
+    patterns = []
+    for template in sorted(templates(), key=len, reverse=True):
+        pieces = re.split(r"\{(\w+)\}", template)
+        if len(pieces) > 1:
+            pattern = "".join(
+                _group(piece, pieces[:position]) if position % 2 else re.escape(piece)
+                for position, piece in enumerate(pieces)
+            )
+            patterns.append((template, re.compile(pattern)))
+    return patterns
+
+
+def _group(name: str, before: Sequence[str]) -> str:
+    """A pattern for a value of a template, which may stand in it several times."""
+    if name in before[1::2]:
+        return f"(?P={name})"
+    texts = "|".join(re.escape(capitalised(place)) for place in PLACES.values())
+    return f"(?P<{name}>{texts})" if name == "begin" else f"(?P<{name}>.+?)"
+
+
+def _each(text: str, part: Callable[[str], str]) -> str:
+    """A list with each of its parts in the chosen language; empty unless all are known."""
+    pieces = re.split(r"(, | and )", text)
+    translated = [part(piece) for piece in pieces[::2]]
+    if not all(translated):
+        return ""
+    conjunction = tr("and")
+    between = [", " if piece == ", " else f" {conjunction} " for piece in pieces[1::2]]
+    return "".join(word + gap for word, gap in zip(translated, [*between, ""], strict=True))
+
+
+def _size(text: str) -> str:
+    """A name with its size; empty if the text is none."""
+    match = _SIZE.fullmatch(text)
+    return f"{tr(match[1])} {notation_within(match[2])}" if match else ""
+
+
+def _name(text: str) -> str:
+    """A name in the chosen language; empty if it is unknown."""
+    words = text.replace("blow_off", "blow-off").replace("_", " ")
+    translated = tr(words)
+    return translated if translated != words else ""
