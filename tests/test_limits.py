@@ -20,6 +20,8 @@ from twin.config import Config
 from twin.errors import ConfigError
 from twin.events import Kind
 from twin.figures.cycle import KeyFigures
+from twin.language import speaking
+from twin.languages import language_of
 from twin.live import run
 from twin.monitor.isolation import Isolation
 from twin.monitor.monitor import Monitor
@@ -114,6 +116,12 @@ def test_the_ends_of_a_range_that_moved_one_after_the_other_stay(configured: Uni
 )
 def test_values_have_a_unit_and_no_exponent(value: float | None, words: str) -> None:
     assert with_unit(value, "ms") == words
+
+
+def test_in_german_values_have_a_decimal_comma() -> None:
+    with speaking(language_of("de", "language")):
+        assert with_unit(7.25, "bar") == "7,25 bar"
+        assert with_unit(None, "bar") == "kein Grenzwert"
 
 
 # --- the running loop -----------------------------------------------------------------------------

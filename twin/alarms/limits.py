@@ -13,7 +13,7 @@ from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, SourceError, known_names
 from twin.figures.settings import FigureSettings, Limits, limits
-from twin.language import tr
+from twin.language import numeral, tr
 from twin.model.dataset import DataSet
 from twin.monitor.monitor import MonitorSettings
 
@@ -119,7 +119,7 @@ def with_unit(value: float | None, unit: str) -> str:
     """A value for people, with about three digits; None is no limit."""
     if value is None:
         return tr("no limit")
-    return f"{value:.0f} {unit}" if abs(value) >= 100.0 else f"{value:.3g} {unit}"
+    return f"{numeral(value, '.0f' if abs(value) >= 100.0 else '.3g')} {unit}"
 
 
 @dataclass(frozen=True)
