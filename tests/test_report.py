@@ -47,6 +47,7 @@ from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError
+from twin.language import speaking
 from twin.languages import language_of
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
@@ -539,6 +540,19 @@ def test_pictures_are_svg_with_a_text_alternative() -> None:
         assert len(svg) < 200_000
 
 
+@pytest.mark.parametrize(
+    ("names", "columns"), [(["measured"] * 4, 4), (["measured"] * 5, 3), (["m" * 40] * 4, 2)]
+)
+def test_a_legend_has_as_many_columns_as_fit(names: list[str], columns: int) -> None:
+    assert drawing.legend_columns(names, drawing.WIDTH) == columns
+
+
+def test_a_long_name_beside_a_low_panel_has_several_lines() -> None:
+    with speaking(language_of("de", "language")):
+        picture = draw_log(found("two"), "")
+    assert picture.axes[2].get_ylabel() == "schwaches\nAbblasen\n(%)"
+
+
 def test_cycle_is_drawn_before_and_after_with_a_cause_only() -> None:
     assert "expected with leakage" in as_svg(draw_cycle(found("explained"), 4, ""))
     healthy = as_svg(draw_cycle(found("consistent"), 4, ""))
@@ -675,7 +689,7 @@ def with_error(mbar: float) -> Evidence:
 
 
 def test_phases_show_the_signature_and_what_is_left_with_a_cause_only() -> None:
-    marks = ("healthy (95 %)", "mean of 2 cycles", "signature of leakage", ">left with leakage<")
+    marks = ("healthy (95 %)", "mean of 2 cycles", "signature of leakage", ">left over<")
     svg = as_svg(draw_phases(found("explained"), laid("explained"), ""))
     assert [mark in svg for mark in marks] == [True, True, True, True]
     svg = as_svg(draw_phases(found("consistent"), laid("consistent"), ""))

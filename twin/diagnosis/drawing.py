@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -19,6 +20,7 @@ from twin.files import require_ending, said_plainly
 from twin.language import notation, numeral
 
 WIDTH = 9.6  # inches
+LETTER, HANDLE = 0.075, 0.6  # inches of a letter, and of the mark of a name, in a legend
 MEASURED, BEFORE, AFTER, QUIET = "#1a1a1a", "#c8500a", "#0a62a8", "#8a8a8a"
 EACH = ("#0a62a8", "#8a3d9e", "#2e7d4f")  # a colour for each cause
 BAND, PALE = "#d5ead8", "#b9b9b9"
@@ -115,10 +117,21 @@ def legend(figure: Figure, panels: Iterable[Axes]) -> None:
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
-    columns = 3 if len(named) in (3, 5, 6) else 4
+    columns = legend_columns(list(named), figure.get_figwidth())
     figure.legend(
         list(named.values()), list(named), loc="outside upper center", ncols=columns, fontsize=9
     )
+
+
+def legend_columns(names: Sequence[str], width: float) -> int:
+    """How many columns of names a legend has: at most 4, and as many as fit in a width (inches)."""
+    lengths = np.array([len(name) for name in names])
+    for columns in (3 if len(names) in (3, 5, 6) else 4, 3, 2):
+        parts = np.array_split(lengths, columns)  # as Matplotlib fills the columns
+        letters = sum(int(part.max()) for part in parts if len(part))
+        if letters * LETTER + columns * HANDLE <= width:
+            return columns
+    return 1
 
 
 def logarithmic(axes: Axes, marked: Sequence[float] = (1.0,)) -> None:

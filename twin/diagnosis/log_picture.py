@@ -1,5 +1,6 @@
 """The picture over the whole log: deviation of each cycle, and course of each cause."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from twin.model.effects import Parameter, effect_of
 from twin.monitor.bins import Floats
 from twin.signals import MBAR
 
+LABEL = 14  # letters in a line of a cause's name beside its panel, which is low
 MOST_CYCLES = 200  # shown of a long log, evenly spread
 
 
@@ -96,7 +98,8 @@ def _course(
         axes.fill_between(times, low, high, color=colour, alpha=0.2, lw=0)
         axes.plot(times, value, color=colour, lw=1.6, label=label)
         axes.axhline(p.neutral(evidence.theta), color=QUIET, lw=0.8, ls=":")
-        axes.set_ylabel(f"{spoken(cause.effect)}\n({p.unit})")
+        name = _in_lines(spoken(cause.effect))
+        axes.set_ylabel(f"{name}\n({p.unit})")
     if several:
         axes.legend(loc="upper left", fontsize=9)
 
@@ -129,6 +132,10 @@ def _moments(evidence: Evidence, cause: Cause) -> Floats:
         edges = evidence.seconds[evidence.starts[:-1]]
     moments = np.concatenate([np.linspace(begin, end, 100), edges - 1e-6, edges])
     return np.unique(np.clip(moments, begin, end))
+
+
+def _in_lines(name: str) -> str:
+    return textwrap.fill(name, LABEL, break_long_words=False, break_on_hyphens=False)
 
 
 def _occurs(axes: Axes, evidence: Evidence, answer: dict[str, Any], colour: str) -> None:

@@ -49,14 +49,15 @@ thead th { border-bottom: 2px solid #888; font-weight: 600; }
 tbody th { font-weight: 400; white-space: nowrap; }
 td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.number { text-align: right; font-variant-numeric: tabular-nums; max-width: 14rem; }
+thead .number { white-space: nowrap; }
 @media (max-width: 40rem) {
   body { margin: .6rem auto; padding: 0 .6rem; }
   dl, article dl { grid-template-columns: fit-content(9rem) 1fr; gap: .2rem .8rem; }
   tbody th { white-space: normal; }
   th, td { padding-right: .7rem; }
   td, td:nth-child(2) { min-width: 0; }
-  .number { white-space: normal; }
+  thead .number { white-space: normal; }
 }
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }

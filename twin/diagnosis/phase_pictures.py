@@ -131,9 +131,7 @@ def draw_phases(diagnosed: Found, laid: Laid, alt: str) -> Picture:
             logarithmic(panels[-1, column])
         panels[0, 0].set_ylabel(tr(DEVIATION))
         if rows > 1:
-            panels[1, 0].set_ylabel(
-                tr("left with {causes}\n(mbar absolute)", causes=diagnosed.name)
-            )
+            panels[1, 0].set_ylabel(tr("left over\n(mbar absolute)"))
         figure.supxlabel(tr("time since the phase began (ms)"), fontsize=10)
         legend(figure, panels.flat)
         return figure
