@@ -1,5 +1,6 @@
 """What another day does to a healthy rig is weather, and what cannot act is no cause."""
 
+import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -94,9 +95,22 @@ def test_weather_that_somebody_measures_is_no_cheap_cause() -> None:
     weather = (Cause("ambient_pressure", {"shift": -10.0}),)
     leak = (Cause("leakage", {"sonic_flow": 1.0}),)
     assert price(evidence, weather) < price(evidence, leak) == price(followed, leak)
-    unlikely = (10.0 / EFFECTS["ambient_pressure"].parameters[0].typical) ** 2
+    effect = EFFECTS["ambient_pressure"]
+    unlikely = (10.0 / effect.parameters[0].typical) ** 2 + 2.0 * math.log(len(effect.laws()))
     assert price(followed, weather) == pytest.approx(price(followed, leak) + unlikely)
     assert often(evidence, EFFECTS["sensor_offset"]) < 1.0
+
+
+@pytest.mark.parametrize("rig", ["gripper", "test_rig"])
+def test_weather_moves_h1_where_the_ejector_s_own_sensor_counts_from_zero(rig: str) -> None:
+    """What the rig shows then, its levels in vacuum moved as the weather did, is one cause."""
+    moved = ("threshold_drift.h1_shift=-25", "threshold_drift.h2_shift=-25")
+    samples, _ = rigs.recorded(rig, 40.0, ("ambient_pressure=-25", *moved), seed=7)
+    diagnosis = diagnose(rigs.config(rig), [samples], "log", lambda _: None)
+    (cause,) = diagnosis.json["causes"]
+    assert cause["effect"] == "ambient_pressure"
+    shift = cause["parameters"]["shift"]
+    assert shift["low95"] < -25.0 < shift["high95"]
 
 
 # --- gauge sensors --------------------------------------------------------------------------------

@@ -265,6 +265,7 @@ def test_every_coefficient_is_filled_in() -> None:
         "SLOW_RAMP_UP",
         "EXHAUST_FOLLOWS",
         "FILTER_AT",
+        "H1_FOLLOWS",
         "SLOW_SENSOR",
     }
     convection = {"FREE_CONVECTION", "FORCED_CONVECTION"}

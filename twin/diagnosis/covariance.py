@@ -23,7 +23,7 @@ from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import LEVELS
-from twin.signals import MBAR, MS, Phase
+from twin.signals import MS, Phase
 
 # Delays of valves: the response of an edge is not linear in them.
 _ACTS = {"response_delay": c.RESPONSE, "blow_off_delay": c.BLOW_OFF_RESPONSE}
@@ -68,7 +68,6 @@ class Covariance:
     mismatch: Floats  # one sigma of the error in what is explained, in each bin
     moves: Floats  # by one sigma of each scatter, (bins, scatters)
     left_open: Floats  # by one sigma of each uncertainty of the data set, first and second order
-    weather: float = 0.0  # mbar, of the log's day over that of the calibration
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
         """Weights of some cycles; not ``scattered``: without the scatter of effects."""
@@ -90,9 +89,7 @@ class Covariance:
         moves *= evidence.healthy.leftover
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
-            # An ejector that switches at an absolute pressure does so at another vacuum that day.
-            common_levels = _common_levels(evidence, cycles) + self.weather**2
-            groups.append(np.diag(sigma**2) + common_levels)
+            groups.append(np.diag(sigma**2) + _common_levels(evidence, cycles))
             moves = np.concatenate([moves, np.zeros((len(sigma), moves.shape[1]))])
         shown = np.array([cycle for cycle, _ in _shown(evidence, cycles)], np.int64)
         factored = parts.CoupledCovariance.of(groups, moves, prior)
@@ -148,8 +145,7 @@ def covariance(
     uncertain = (*evidence.uncertain, *_another_day(evidence, ambient))
     off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
-    weather = (ambient - float(evidence.calibrated[c.AMBIENT])) / MBAR
-    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open, weather)
+    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open)
 
 
 def _farthest_ambient(evidence: Evidence, about: Hypothesis) -> float:

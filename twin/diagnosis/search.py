@@ -7,6 +7,7 @@ its penalty beside the others. Last, each must predict held-out cycles; if the f
 the search starts again with the next.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
@@ -210,6 +211,8 @@ def _beside_rivals(
             current = replace(current, found=found)
         visited.add(current.found.kind)
         rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
+        if current.found.effects == (WEATHER,):
+            return _weather_or_rival(evidence, fitted, current, rivals[0])
         better = _overtaking(current.found, rivals)
         if better is None or better.kind in visited:
             break
@@ -229,16 +232,47 @@ def _beside_rivals(
         if not remaining:
             return None
         current = _about(evidence, fitted, remaining)
-    if current.found.effects == (WEATHER,):  # it may be first by its prior alone
-        found, *rivals[0] = sorted(
-            [current.found, *rivals[0]],
-            key=lambda candidate: score_with_tempered_prior(
-                evidence, candidate.score, candidate.hypothesis
-            ),
-        )
-        if found is not current.found:
-            current = replace(current, found=found, known=covariance(evidence, found.hypothesis))
     return current, rivals
+
+
+def _weather_or_rival(
+    evidence: Evidence, fitted: Sequence[int], weather: _Found, rivals: Sequence[Fitted]
+) -> tuple[_Found, list[list[Fitted]]]:
+    """The best of weather and its rivals, and those of the others that the log cannot reject.
+
+    Weather may be first by its prior alone. Each is compared with weights about itself: by those
+    about weather, which are wide, a rival would share in what only weather leaves open. A rival
+    must be confirmed on held-out cycles, as weather was.
+    """
+    candidates = [
+        weather,
+        *at_once(lambda rival: _about(evidence, fitted, rival.hypothesis), rivals),
+    ]
+
+    def score(candidate: _Found) -> float:
+        own_score = candidate.found.score + candidate.weights.volume
+        return score_with_tempered_prior(evidence, own_score, candidate.found.hypothesis)
+
+    candidates.sort(key=score)
+    best = next(
+        candidate
+        for candidate in candidates
+        if candidate is weather or _confirmed(evidence, fitted, candidate) is candidate.found
+    )
+    worst = score_without_prior(evidence, best.found.score, best.found.hypothesis)
+    worst += CHI2_999 * max(best.found.leftover**2, 1.0)
+    comparable = [
+        replace(other.found, score=other.found.score + other.weights.volume - best.weights.volume)
+        for other in candidates
+        if other is not best
+    ]
+    return best, [
+        [
+            other
+            for other in comparable
+            if score_without_prior(evidence, other.score, other.hypothesis) < worst
+        ]
+    ]
 
 
 def _has(fits: Sequence[Fitted], candidate: Fitted) -> bool:
@@ -337,20 +371,22 @@ def _likeliest(
     nearest = [candidate for candidate in ranked if candidate.score < NEAR * ranked[0].score][
         :TRIED_ALONE
     ]
-    nearest += [
-        candidate for candidate in _weather(evidence, ranked) if not _has(nearest, candidate)
+    weather_fits = _weather(evidence, ranked)
+    compared = [candidate.hypothesis for candidate in nearest if not _has(weather_fits, candidate)]
+    compared += [
+        _with_weather_weights(evidence, fitted, candidate.hypothesis) for candidate in weather_fits
     ]
 
-    def alone(first: Fitted) -> tuple[float, float, Fitted]:
-        residual_covariance = covariance(evidence, first.hypothesis, both_ways=False)
+    def alone(first: Hypothesis) -> tuple[float, float, Fitted]:
+        residual_covariance = covariance(evidence, first, both_ways=False)
         judged, weights = residual_covariance.of(evidence.judged), residual_covariance.of(fitted)
-        (candidate,) = fit(evidence, weights, [first.hypothesis])
+        (candidate,) = fit(evidence, weights, [first])
         chi2 = float(np.sum(white(evidence, judged, [candidate.hypothesis]) ** 2))
         price = candidate.score - candidate.chi2
         return chi2 + judged.volume + price, candidate.score + weights.volume, candidate
 
     best: dict[tuple[str, ...], tuple[float, float, Fitted]] = {}
-    for entry in at_once(alone, nearest):
+    for entry in at_once(alone, compared):
         score, _, candidate = entry
         if candidate.effects not in best or score < best[candidate.effects][0]:
             best[candidate.effects] = entry
@@ -360,6 +396,22 @@ def _likeliest(
         if best[weather.effects][1] < least + CHI2_999 * max(best_fit.leftover**2, 1.0):
             return [weather, *(candidate for candidate in order if candidate is not weather)]
     return order
+
+
+def _with_weather_weights(
+    evidence: Evidence, fitted: Sequence[int], weather: Hypothesis
+) -> Hypothesis:
+    """Weather with the law and the size that fit best by weights about typical weather.
+
+    By those of the calibration's day its response counts as exact, and a fit ends where it is.
+    """
+    starts = [
+        sized(evidence, by_law, np.array([steps]))
+        for by_law in by_each_law(weather, 0)
+        for steps in (1.0, -1.0)
+    ]
+    weights = covariance(evidence, starts[0], both_ways=False).of(fitted)
+    return min(fit(evidence, weights, starts), key=lambda candidate: candidate.score).hypothesis
 
 
 def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
@@ -524,6 +576,8 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         alternatives = fit(evidence, weights, without) if without[0] else []
         without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
         gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
+        if found.effects == (WEATHER,):
+            gains = [_weather_gain(evidence, unseen, found.hypothesis)]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(found)
         if (
@@ -550,6 +604,21 @@ def held_out_gain(
     sigma = max(float(np.sqrt(np.mean(after**2))), 1.0)
     gain = float(before @ before - after @ after)
     reach = SIGMAS_95 * 2.0 * float(np.linalg.norm(before - after)) * sigma
+    return gain - reach, gain + reach
+
+
+def _weather_gain(evidence: Evidence, unseen: Weights, weather: Hypothesis) -> tuple[float, float]:
+    """``held_out_gain`` of weather, where the healthy twin has the weights about itself.
+
+    By those about weather, which are wide, much of the deviation would count as left open without
+    any weather. A gain of |d|² has a sigma of 2 |d|.
+    """
+    healthy = covariance(evidence).of(unseen.cycles)
+    before = float(np.sum(white(evidence, healthy, [HEALTHY]) ** 2)) + healthy.volume
+    after = white(evidence, unseen, [weather])
+    gain = before - float(np.sum(after**2)) - unseen.volume
+    sigma = max(float(np.sqrt(np.mean(after**2))), 1.0)
+    reach = SIGMAS_95 * 2.0 * math.sqrt(max(gain, 0.0)) * sigma
     return gain - reach, gain + reach
 
 

@@ -140,6 +140,8 @@ class Ejector(Settings):
     # Vacuum at which air saving switches the nozzle off.
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
     h1_hysteresis_mbar: float = Field(150.0, gt=0.0)  # below H1, at which it is on again
+    # 1: the ejector's own sensor counts from zero, so H1 moves with ambient pressure.
+    h1_follows_ambient: float = Field(0.0, ge=0.0, le=1.0)
     h2_mbar: float = Field(550.0, gt=0.0, le=998.0)  # vacuum at which the part is present
     h2_hysteresis_mbar: float = Field(10.0, gt=0.0)  # below H2, at which the part is gone
     # As it is set at the ejector.
@@ -346,6 +348,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.CRACKING_PRESSURE] = ejector.cracking_pressure_mbar * MBAR
     theta[[c.H1, c.H2]] = ejector.h1_mbar * MBAR, ejector.h2_mbar * MBAR
     theta[c.H1_LOW] = (ejector.h1_mbar - ejector.h1_hysteresis_mbar) * MBAR
+    theta[c.H1_FOLLOWS] = ejector.h1_follows_ambient
     theta[c.H2_LOW] = (ejector.h2_mbar - ejector.h2_hysteresis_mbar) * MBAR
     theta[c.AIR_SAVING] = AIR_SAVING_MODES[ejector.air_saving]
     theta[c.PERMITTED_LEAKAGE] = ejector.permitted_leakage_mbar_s * MBAR

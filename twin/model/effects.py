@@ -215,6 +215,7 @@ def _ambient_pressure(theta: Theta, shift: float) -> None:
     theta[c.AMBIENT] += shift * MBAR
     # The absolute reading of a gauge sensor was calculated with the assumed ambient pressure.
     theta[c.SENSOR_OFFSET] -= theta[c.GAUGE] * shift * MBAR
+    theta[[c.H1, c.H1_LOW]] += theta[c.H1_FOLLOWS] * shift * MBAR
 
 
 _P = Parameter
@@ -369,6 +370,8 @@ _TABLE = (
         (_P("shift", "mbar", -300.0, 100.0, 15.0),),
         _ambient_pressure,
         WEEKLY,
+        # The ejector's own sensor counts from ambient pressure, or from zero.
+        law=Law("h1_follows_ambient", c.H1_FOLLOWS, (0.0, 1.0)),
         can_be_mended=False,
     ),
 )

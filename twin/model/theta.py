@@ -110,6 +110,7 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     "SENSOR_GAIN": ("1", "reads this many times the vacuum"),
     "H1": ("Pa", "below ambient, nozzle off"),
     "H1_LOW": ("Pa", "below ambient, nozzle on again"),
+    "H1_FOLLOWS": ("1", "share of a change of ambient pressure by which both move"),
     "H2": ("Pa", "below ambient, part present"),
     "H2_LOW": ("Pa", "below ambient, not any more"),
     "RELEASE": (
@@ -200,6 +201,7 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     SENSOR_GAIN,
     H1,
     H1_LOW,
+    H1_FOLLOWS,
     H2,
     H2_LOW,
     RELEASE,

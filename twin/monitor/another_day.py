@@ -23,10 +23,12 @@ BAROMETER = 2.0 * MBAR  # Pa, one sigma; cheap ones are within 3 or 4 mbar
 ZERO = 2.0 * MBAR
 HALL_K = 10.0  # one sigma if not measured: 15 °C and 35 °C are both within a year's two sigmas
 SMALLEST = 1e-4  # a smaller relative change is left out
-# Coefficients that vary together: suction, flows of valves, of leaks, and friction in the line.
+# Coefficients that vary together: suction, blow-off, what it leaves through, leaks, and friction in
+# the line. Blow-off comes from the supply and does not vary with what it leaves through.
 ALIKE = (
     (c.SUCTION,),
-    (c.BLOW_OFF, c.RELIEF, c.EXHAUST),
+    (c.BLOW_OFF,),
+    (c.RELIEF, c.EXHAUST),
     (c.LEAK, c.LAMINAR_LEAK, c.OPENING, c.HOLE, c.BACK_FLOW),
     (c.RESISTANCE, c.NEAR_RESISTANCE, c.LAMINAR, c.NEAR_LAMINAR, c.PLACE),
 )
