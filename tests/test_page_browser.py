@@ -175,6 +175,22 @@ def test_the_light_follows_the_alarm_and_every_tab_sees_who_took_care(site: Site
     expect(card(mine).get_by_role("button", name="Acknowledge")).to_have_count(0)
 
 
+def test_the_first_view_needs_less_than_500_kb(site: Site) -> None:
+    site.run.suck(10.0)
+    site.run.leak()
+    page = site.open()
+    site.until_light(page, "red")
+    expect(card(page)).to_be_visible()
+    loaded: dict[str, int] = page.evaluate(
+        """() => Object.fromEntries(performance.getEntries()
+          .filter((entry) => "transferSize" in entry)
+          .map((entry) => [new URL(entry.name).pathname, entry.transferSize]))"""
+    )
+    assert {"/", "/static/page.js", "/static/page.css"} <= loaded.keys()
+    assert all(loaded[path] > 0 for path in ("/", "/static/page.js"))
+    assert sum(loaded.values()) < 500e3
+
+
 @pytest.mark.parametrize("site", [3], indirect=True)
 def test_it_opens_on_what_is_worst_and_lists_all_alarms_worst_first(site: Site) -> None:
     low, leaking, stale = site.runs
