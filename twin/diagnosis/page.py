@@ -167,8 +167,9 @@ def table(
     """Return a table; the columns ``numbers`` are right-aligned."""
     right = set(numbers)
     style = [' class="number"' if i in right else "" for i in range(len(head))]
-    top = "".join(
-        f'<th scope="col"{s}>{html.escape(h)}</th>' for h, s in zip(head, style, strict=True)
+    top = "".join(  # the corner above the rows' heads, which has no text, is no heading
+        f'<th scope="col"{s}>{html.escape(h)}</th>' if h else f"<td{s}></td>"
+        for h, s in zip(head, style, strict=True)
     )
     body = "".join(f"<tr>{_row(row, style)}</tr>\n" for row in rows)
     return (
