@@ -14,7 +14,8 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
-from twin.signals import BREAK, NS, Samples, Signal
+from twin.monitor.rows import elapsed
+from twin.signals import BREAK, Samples, Signal
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
@@ -44,8 +45,7 @@ class Plant:
 
     def run(self, block: Samples) -> tuple[Floats, Bytes]:
         """Pressures (Pa, absolute, as the PLC's sensor reads them) and ``Signal`` bits, per row."""
-        previous_ns = block["time_ns"][:1] if self._last_ns is None else self._last_ns
-        dt = np.diff(block["time_ns"], prepend=previous_ns) * NS
+        dt = elapsed(block, self._last_ns)
         broken = (block["quality"] & BREAK) != 0
         is_restart = broken & ((dt < 0.0) | (dt > LONGEST_GAP_S))
         dt[is_restart] = 0.0

@@ -18,7 +18,7 @@ from twin.monitor.detector_window import knees_of
 from twin.monitor.gaps import ShortGaps
 from twin.monitor.monitor import Monitor, in_order
 from twin.monitor.phase_detector import Found, Knees, PhaseFinder
-from twin.monitor.rows import time_steps
+from twin.monitor.rows import TimeSteps
 from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
 from twin.signals import SAMPLE, TICK, Command, Phase, Samples, Ticks
@@ -62,7 +62,7 @@ class Twin:
     knees: Knees
     terms: Sequence[Term] = ()
     _solver: DenseSolver = field(default_factory=DenseSolver)
-    _last_ns: int | None = None
+    _steps: TimeSteps = field(default_factory=TimeSteps)
     _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class Twin:
         ticks = np.empty(len(samples), TICK)
         ticks["phase"], ticks["level"] = phase, level
         expected = np.empty(len(samples))
-        dt = time_steps(samples, self._last_ns)
+        dt = self._steps.over(samples)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
         for rows, surroundings in self._surrounded(samples, ticks):
             self._surrounded_theta = following(self._surrounded_theta, surroundings)
@@ -106,7 +106,7 @@ class Twin:
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
-            self._last_ns, self._phase = int(samples["time_ns"][-1]), int(phase[-1])
+            self._phase = int(phase[-1])
         return samples, ticks
 
     def _surrounded(self, samples: Samples, ticks: Ticks) -> Iterable[tuple[slice, Samples]]:

@@ -153,6 +153,20 @@ def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArra
 
 
 @dataclass
+class LastRow:
+    """The newest row of a stream, kept over its blocks."""
+
+    row: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # none before the first
+
+    def keep(self, samples: Samples) -> Samples:
+        """Keep a copy of the newest of ``samples``, if any; returns the row before them."""
+        before = self.row
+        if len(samples):
+            self.row = samples[-1:].copy()
+        return before
+
+
+@dataclass
 class Bridge:
     """Removes the marks of gaps of a few rows from blocks: the model steps over them.
 
@@ -160,11 +174,11 @@ class Bridge:
     since nobody knows what happened; so do gaps whose length the sequence numbers do not tell.
     """
 
-    _before: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the row before
+    _last: LastRow = field(default_factory=LastRow)
 
     def over(self, block: Samples) -> Samples:
         """The block unchanged, or a copy without these marks."""
-        previous, self._before = self._before, block[-1:].copy() if len(block) else self._before
+        previous = self._last.keep(block)
         if not (block["quality"] & np.uint8(Quality.GAP)).any():
             return block
         rows = np.concatenate([previous, block])

@@ -78,7 +78,7 @@ class Cycles:
         cls, rows: Samples, phase: Bytes, level: Floats, theta: Floats, *, quickly: bool
     ) -> "Cycles":
         """Cycles with ``phase`` and ``level``; bins only where the model of ``theta`` is finite."""
-        dt = time_steps(rows, None)
+        dt = time_steps(rows)
         expected = _expected(theta.reshape(-1, 1), dt, phase, level)[:, 0]
         usable = ((rows["quality"] & UNUSABLE) == 0) & np.isfinite(rows["pressure"])
         bins = binned(phase, usable & np.isfinite(expected), _edges(phase), BINS)

@@ -136,7 +136,7 @@ class Evidence:
     @cached_property
     def _times(self) -> Floats:
         """Cumulative time (s) as the kernel uses it; −1 s marks a break."""
-        return np.cumsum(time_steps(self.samples, None))
+        return np.cumsum(time_steps(self.samples))
 
     @cached_property
     def _measured(self) -> Floats:

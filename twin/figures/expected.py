@@ -19,7 +19,7 @@ from twin.model.dense_solver import DenseSolver
 from twin.model.term import Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import STALE
-from twin.monitor.rows import time_steps
+from twin.monitor.rows import TimeSteps
 from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
 
 LONGEST_SUCTION_S = 60.0  # in which H1 must be reached from rest
@@ -38,7 +38,7 @@ class Expectation:
     data: DataSet
     _solver: DenseSolver | None = None  # None until there is a level to start from
     _control: kernel.Control = field(default_factory=kernel.Control.anew)
-    _last_ns: int | None = None
+    _steps: TimeSteps = field(default_factory=TimeSteps)
     _edges: int = 0  # since it began
     _rows: int = 0  # of the cycle so far
     _stale: bool = False  # rows of this cycle are stale: the commands are unknown
@@ -58,7 +58,7 @@ class Expectation:
         if not len(samples):
             return
         first, self._rows = self._rows == 0, self._rows + len(samples)
-        dt, self._last_ns = time_steps(samples, self._last_ns), int(samples["time_ns"][-1])
+        dt = self._steps.over(samples)
         self._stale |= bool((samples["quality"] & STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
             self.lose()

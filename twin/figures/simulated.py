@@ -18,7 +18,8 @@ from twin.model.term import Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Ints
 from twin.monitor.cycles import Cycle, cut
-from twin.signals import BAR, MBAR, MS, NS, SAMPLE, Phase, Samples, Ticks, joined, unbroken
+from twin.monitor.rows import elapsed
+from twin.signals import BAR, MBAR, MS, SAMPLE, Phase, Samples, Ticks, joined, unbroken
 
 LONGEST_STEP = 20.0  # median steps; a longer one is a gap, and is replaced by the median
 LONGEST_PAUSE = 10.0  # median cycles; a longer cycle contains a pause of production
@@ -38,7 +39,7 @@ class Program:
 
         Gaps become median steps, and so do steps between cycles that were not consecutive.
         """
-        steps = np.diff(samples["time_ns"], prepend=samples["time_ns"][0]) * NS
+        steps = elapsed(samples)
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else MS
         is_gap = (steps <= 0.0) | (steps > LONGEST_STEP * usual)
         steps[is_gap] = usual

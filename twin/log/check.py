@@ -13,7 +13,7 @@ from twin.log.reader import Log, decode_event_message, decode_rows, open_log
 from twin.log.recorder import Recorder
 from twin.log.records import Damage, messages
 from twin.log.schema import EVENTS, SAMPLES
-from twin.signals import NS, SAMPLE, Quality, Samples, Ticks, unseen_ns
+from twin.signals import NS, LastRow, Quality, Samples, Ticks, unseen_ns
 
 Piece = tuple[Samples, Ticks, list[Event]]
 
@@ -88,12 +88,11 @@ class _StreamStatistics:
         self.samples = self.events = self.gaps = self.missing = 0
         self.restarts = self.time_back = 0
         self.duration_s = self.unseen_s = 0.0
-        self._last = np.empty(0, SAMPLE)
+        self._last = LastRow()
 
     def add(self, samples: Samples) -> None:
         self.samples += len(samples)
-        rows = np.concatenate((self._last, samples))
-        self._last = rows[-1:]
+        rows = np.concatenate((self._last.keep(samples), samples))
         skipped = np.diff(rows["sequence"]) - 1
         restarts = ((rows["quality"][1:] & Quality.RESTART) != 0) | (skipped < 0)
         gaps = (skipped > 0) | restarts

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from twin.events import Event, Kind
 from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
 from twin.model.compiled import compiled
-from twin.signals import NEW_TIME, SAMPLE, Samples
+from twin.signals import NEW_TIME, SAMPLE, LastRow, Samples
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady
@@ -137,31 +137,38 @@ def _first_plain(
 
 
 @dataclass
+class _Estimate:
+    """What is known of the clocks since PLC time began or was set."""
+
+    zero: tuple[int, int] | None = None  # origin of PLC time, and of host less PLC time
+    last: tuple[int, int] = (0, 0)  # PLC time and sequence of the receipt before
+    clock_step: float = 0.0  # ns, PLC time less that by the count of the scans
+    suspected_steps: list[float] = field(default_factory=list)  # large steps of the last receipts
+    window: int = 0
+    fastest: tuple[int, int] | None = None  # receipt of the window: time and transport, ns
+    transports: list[int] = field(default_factory=list)  # transports of the window's receipts, ns
+    # Windows before: time and transport of the fastest, and the median delay behind it, ns.
+    points: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    since: int = 0  # windows since the last report
+    off_windows: int = 0  # windows in a row off the line; below zero if they are early
+    line: tuple[float, float, float] = (0.0, 0.0, 0.0)  # slope, value and time (ns) at its end
+    windows_since_fit: int = 0  # windows since the line was fitted
+
+
+@dataclass
 class ClockWatch:
     """Turns rows into events of the clocks; all in PLC time."""
 
-    _receipt: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # its newest row
+    _last: LastRow = field(default_factory=LastRow)
     _lead: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
     _period: float = 0.0  # ns a scan; 0 until it is known
-    _zero: tuple[int, int] | None = None  # origin of PLC time, and of host less PLC time
-    _last: tuple[int, int] = (0, 0)  # PLC time and sequence of the receipt before
-    _clock_step: float = 0.0  # ns, PLC time less that by the count of the scans
-    _suspected_steps: list[float] = field(default_factory=list)  # large steps of the last receipts
-    _window: int = 0
-    _fastest: tuple[int, int] | None = None  # receipt of the window: time and transport, ns
-    _transports: list[int] = field(default_factory=list)  # transports of the window's receipts, ns
-    # Windows before: time and transport of the fastest, and the median delay behind it, ns.
-    _points: Floats = field(default_factory=lambda: np.empty((3, 0)))
-    _since: int = 0  # windows since the last report
-    _off_windows: int = 0  # windows in a row off the line; below zero if they are early
-    _line: tuple[float, float, float] = (0.0, 0.0, 0.0)  # slope, value and time (ns) at its end
-    _windows_since_fit: int = 0  # windows since the line was fitted
+    _now: _Estimate = field(default_factory=_Estimate)
 
     def __post_init__(self) -> None:
         """Compile now, so that no block has to wait for it."""
         _slopes(np.zeros(2), np.zeros(2))
         row = np.zeros(1, SAMPLE)
-        _first_plain(_receipts(row, row), self._last, 0, 0, 0.0, 0.0)
+        _first_plain(_receipts(row, row), self._now.last, 0, 0, 0.0, 0.0)
 
     def push(self, samples: Samples) -> list[Event]:
         """Take rows; only the first may have a break before it."""
@@ -170,9 +177,9 @@ class ClockWatch:
         events = []
         if samples["quality"][0] & NEW_TIME:
             events += self.close()
+            self._last, self._period = LastRow(), 0.0
             self._begin()
-        receipts = _receipts(self._receipt, samples)
-        self._receipt = samples[-1:].copy()
+        receipts = _receipts(self._last.keep(samples), samples)
         self._learn_period(samples)
         while len(receipts):
             if plain := self._plain_count(receipts):
@@ -184,15 +191,15 @@ class ClockWatch:
 
     def close(self) -> list[Event]:
         """Report the rows since the last report, if they suffice."""
-        if not len(self._receipt):
+        if not len(self._last.row):
             return []
-        if len(self._transports) >= FULL:
+        if len(self._now.transports) >= FULL:
             self._close_window()
-        return list(self._report(int(self._receipt["time_ns"][0])))
+        return list(self._report(int(self._last.row["time_ns"][0])))
 
     def _begin(self) -> None:
-        fresh = ClockWatch()
-        self.__dict__.update(fresh.__dict__)
+        """Begin the estimate anew."""
+        self._lead, self._now = np.empty(0, SAMPLE), _Estimate()
 
     def _learn_period(self, samples: Samples) -> None:
         """Learn the period of the scans from the first LEAD rows."""
@@ -209,41 +216,43 @@ class ClockWatch:
 
         They lie in the current window, and ``_was_set`` would find no step in any of them.
         """
-        if self._zero is None or self._clock_step or self._suspected_steps:
+        if self._now.zero is None or self._now.clock_step or self._now.suspected_steps:
             return 0
-        zero_ns, period = self._zero[0], self._period
-        plain = _first_plain(receipts, self._last, zero_ns, self._window, period, self._least_step)
+        zero_ns, period = self._now.zero[0], self._period
+        plain = _first_plain(
+            receipts, self._now.last, zero_ns, self._now.window, period, self._least_step
+        )
         return int(plain)
 
     def _take_plain(self, receipts: Integers) -> None:
         """Take receipts that only add a transport; equivalent to ``_take`` of each."""
-        assert self._zero is not None
+        assert self._now.zero is not None
         time_ns, host_ns, sequence = receipts.T
-        since = time_ns - self._zero[0]
-        transports = host_ns - sum(self._zero) - since
+        since = time_ns - self._now.zero[0]
+        transports = host_ns - sum(self._now.zero) - since
         first = int(np.argmin(transports))
-        if self._fastest is None or transports[first] < self._fastest[1]:
-            self._fastest = int(since[first]), int(transports[first])
-        self._transports += transports.tolist()
-        self._last = int(time_ns[-1]), int(sequence[-1])
+        if self._now.fastest is None or transports[first] < self._now.fastest[1]:
+            self._now.fastest = int(since[first]), int(transports[first])
+        self._now.transports += transports.tolist()
+        self._now.last = int(time_ns[-1]), int(sequence[-1])
 
     def _take(self, time_ns: int, host_ns: int, sequence: int) -> Iterator[Event]:
         transport = host_ns - time_ns
-        if self._zero is None:
-            self._zero = time_ns, transport
+        if self._now.zero is None:
+            self._now.zero = time_ns, transport
         elif (moved := self._was_set(time_ns, sequence)) is not None:
             yield from self._report_step(time_ns, moved, "PLC time was set by {:+.1f} ms")
-            self._zero = time_ns, transport
-        self._last = time_ns, sequence
-        point = time_ns - self._zero[0], transport - self._zero[1]
-        if point[0] // WINDOW_NS != self._window:
+            self._now.zero = time_ns, transport
+        self._now.last = time_ns, sequence
+        point = time_ns - self._now.zero[0], transport - self._now.zero[1]
+        if point[0] // WINDOW_NS != self._now.window:
             yield from self._next_window(time_ns)
-            if self._zero is None:  # it begins anew
-                self._zero, point = (time_ns, transport), (0, 0)
-            self._window = point[0] // WINDOW_NS
-        self._transports.append(point[1])
-        if self._fastest is None or point[1] < self._fastest[1]:
-            self._fastest = point
+            if self._now.zero is None:  # it begins anew
+                self._now.zero, point = (time_ns, transport), (0, 0)
+            self._now.window = point[0] // WINDOW_NS
+        self._now.transports.append(point[1])
+        if self._now.fastest is None or point[1] < self._now.fastest[1]:
+            self._now.fastest = point
 
     # --- a clock that was set -------------------------------------------------------------------
 
@@ -254,57 +263,64 @@ class ClockWatch:
 
     def _was_set(self, time_ns: int, sequence: int) -> float | None:
         """Step (ns) of PLC time against the count some receipts ago, if it lasted."""
-        scans = sequence - self._last[1]
+        scans = sequence - self._now.last[1]
         if not self._period or not 0 < scans <= FARTHEST:
-            self._clock_step = 0.0
-            self._suspected_steps.clear()
+            self._now.clock_step = 0.0
+            self._now.suspected_steps.clear()
             return None
-        self._clock_step += time_ns - self._last[0] - scans * self._period
-        if abs(self._clock_step) < self._least_step:
-            self._clock_step = 0.0  # the count's own clock may run a little differently
-            self._suspected_steps.clear()
+        self._now.clock_step += time_ns - self._now.last[0] - scans * self._period
+        if abs(self._now.clock_step) < self._least_step:
+            self._now.clock_step = 0.0  # the count's own clock may run a little differently
+            self._now.suspected_steps.clear()
             return None
-        self._suspected_steps.append(self._clock_step)
-        if len(self._suspected_steps) <= CONFIRMED:
+        self._now.suspected_steps.append(self._now.clock_step)
+        if len(self._now.suspected_steps) <= CONFIRMED:
             return None
-        least, most = min(self._suspected_steps), max(self._suspected_steps)
-        return median(self._suspected_steps) if least * most > 0 else None
+        least, most = min(self._now.suspected_steps), max(self._now.suspected_steps)
+        return median(self._now.suspected_steps) if least * most > 0 else None
 
     def _report_step(self, time_ns: int, by_ns: float, text: str) -> Iterator[Event]:
         """Report the estimate so far and the step, and begin the estimate anew."""
-        self._fastest, self._transports = None, []  # these may be from before the step or after it
+        self._now.fastest, self._now.transports = (
+            None,
+            [],
+        )  # these may be from before the step or after it
         yield from self._report(time_ns)
         data = {"jump_s": by_ns * 1e-9}
         yield Event(time_ns, Kind.CLOCK_JUMPED, text.format(by_ns * 1e-6), data)
-        receipt, period = self._receipt, self._period
         self._begin()
-        self._receipt, self._period = receipt, period
 
     # --- the fastest of each window -------------------------------------------------------------
 
     def _next_window(self, time_ns: int) -> Iterator[Event]:
         off = self._close_window()
-        if -self._off_windows >= SHORTER or self._off_windows >= LONGER:
+        if -self._now.off_windows >= SHORTER or self._now.off_windows >= LONGER:
             text = "the clocks were moved by {:+.1f} ms against each other"
-            text += ", or the samples' way is longer now" if self._off_windows > 0 else ""
+            text += ", or the samples' way is longer now" if self._now.off_windows > 0 else ""
             yield from self._report_step(time_ns, -off, text)
-        elif self._since >= EVERY:
+        elif self._now.since >= EVERY:
             yield from self._report(time_ns)
 
     def _close_window(self) -> float:
         """Close the window; its offset (ns) from the line if it is an outlier, else 0."""
-        if self._fastest is None:
+        if self._now.fastest is None:
             return 0.0
-        off = self._outlier_offset(self._fastest)
-        self._off_windows = (
+        off = self._outlier_offset(self._now.fastest)
+        self._now.off_windows = (
             0
             if not off
-            else int(np.sign(off)) + (self._off_windows if off * self._off_windows > 0 else 0)
+            else int(np.sign(off))
+            + (self._now.off_windows if off * self._now.off_windows > 0 else 0)
         )
-        late = median(self._transports) - self._fastest[1]
-        self._points = np.column_stack([self._points[:, -KEPT + 1 :], [*self._fastest, late]])
-        self._since, self._windows_since_fit = self._since + 1, self._windows_since_fit + 1
-        self._fastest, self._transports = None, []
+        late = median(self._now.transports) - self._now.fastest[1]
+        self._now.points = np.column_stack(
+            [self._now.points[:, -KEPT + 1 :], [*self._now.fastest, late]]
+        )
+        self._now.since, self._now.windows_since_fit = (
+            self._now.since + 1,
+            self._now.windows_since_fit + 1,
+        )
+        self._now.fastest, self._now.transports = None, []
         return off
 
     def _outlier_offset(self, point: tuple[int, int]) -> float:
@@ -312,7 +328,7 @@ class ClockWatch:
         x, y, late = self._settled_points
         if len(x) < FEWEST:
             return 0.0
-        if self._windows_since_fit > OLDEST * len(x):
+        if self._now.windows_since_fit > OLDEST * len(x):
             self._fit_line()
         if abs(self._off_line(*point)) <= SET_NS:  # nearly always
             return 0.0
@@ -324,17 +340,17 @@ class ClockWatch:
 
     def _fit_line(self) -> None:
         x, y, _ = self._settled_points
-        self._line, self._windows_since_fit = (*line(x, y), float(x[-1])), 0
+        self._now.line, self._now.windows_since_fit = (*line(x, y), float(x[-1])), 0
 
     def _off_line(self, x: Number, y: Number) -> Number:
-        slope, at_end, end = self._line
+        slope, at_end, end = self._now.line
         return y - at_end - slope * (x - end)
 
     def _report(self, time_ns: int) -> Iterator[Event]:
-        if self._settled_points.shape[1] < FEWEST or not self._since or self._zero is None:
+        if self._settled_points.shape[1] < FEWEST or not self._now.since or self._now.zero is None:
             return
-        self._since = 0
-        estimate = self._estimate(time_ns - self._zero[0], self._zero[1])
+        self._now.since = 0
+        estimate = self._estimate(time_ns - self._now.zero[0], self._now.zero[1])
         data = {name: float(f"{value:.6g}") for name, value in vars(estimate).items()}
         data["offset_ms"] = round(float(estimate.offset_ms), 3)
         yield Event(time_ns, Kind.CLOCK, str(estimate), data)
@@ -343,7 +359,7 @@ class ClockWatch:
         """The estimate, with the line extrapolated to ``now``."""
         x, y, _ = self._settled_points
         self._fit_line()
-        slope, at_end, _ = self._line
+        slope, at_end, _ = self._now.line
         drift_pm = slope_pm(x, y)
         scatter = MAD_TO_SIGMA * median(np.abs(self._off_line(x, y)).tolist())
         offset_pm = SIGMAS_95 * scatter + drift_pm * float(x[-1] - x[0]) / 2
@@ -353,4 +369,4 @@ class ClockWatch:
     @property
     def _settled_points(self) -> Floats:
         """Windows without the last ones that are off the line: a new line may begin there."""
-        return self._points[:, : self._points.shape[1] - abs(self._off_windows)]
+        return self._now.points[:, : self._now.points.shape[1] - abs(self._now.off_windows)]

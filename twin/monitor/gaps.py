@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin.events import Event, Kind
-from twin.signals import MOST_BRIDGED, NS, SAMPLE, Bridge, Quality, Samples, unseen_ns
+from twin.signals import MOST_BRIDGED, NS, Bridge, LastRow, Quality, Samples, unseen_ns
 
 APART_NS = 1_000_000_000  # between events of short gaps: a stream may have dozens a second
 
@@ -34,7 +34,7 @@ class ShortGaps:
     _marks: list[int] = field(default_factory=list)  # marked rows that have not come back
     _in: int = 0  # rows so far
     _out: int = 0
-    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row that came back
+    _last: LastRow = field(default_factory=LastRow)  # that came back
     _events: list[Event] = field(default_factory=list)
     _reported_ns: int | None = None
     _gaps: int = 0  # not yet reported, and rows missing in them
@@ -58,8 +58,8 @@ class ShortGaps:
             samples = samples.copy()
             samples["quality"][marked_rows] |= np.uint8(Quality.GAP)
             for row in marked_rows:
-                self._report(samples[row - 1] if row else self._last[0], samples[row])
-        self._last = samples[-1:].copy() if len(samples) else self._last
+                self._report(samples[row - 1] if row else self._last.row[0], samples[row])
+        self._last.keep(samples)
         return samples
 
     def told(self) -> list[Event]:

@@ -22,6 +22,7 @@ from twin.monitor.another_day import of_the_day
 from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
 from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Stretches
+from twin.monitor.rows import time_steps
 from twin.signals import BREAK, MS, NS, Phase, Samples, Ticks, joined
 
 BATCH = 250  # fewest rows processed together: each call has a fixed cost
@@ -216,8 +217,8 @@ class ModelBank:
         if not len(rows):
             return
         samples, after = samples[rows], ticks["phase"][np.minimum(rows + 1, len(ticks) - 1)]
-        dt = np.diff(samples["time_ns"], prepend=self._drawn_until_ns) * NS
-        dt[(dt < 0.0) | (samples["quality"] & BREAK != 0)] = -1.0
+        dt = time_steps(samples, self._drawn_until_ns)
+        dt[dt < 0.0] = -1.0
         expected = np.empty((len(rows), self._theta.shape[1]))
         phase = _phases(ticks["phase"][rows], after, self._theta.shape[1])
         level = ticks["level"][rows].astype(np.float64)

@@ -39,6 +39,7 @@ from twin.signals import (
     NS,
     SAMPLE,
     TICK,
+    LastRow,
     Quality,
     Samples,
     Ticks,
@@ -134,8 +135,8 @@ class Monitor:
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
     _farthest: float = 0.0  # largest excess (sigmas) of a cycle since the alarm was raised
     _quiet_cycles: int = 0
-    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # row of the stream
-    _fresh: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last fresh row
+    _last: LastRow = field(default_factory=LastRow)
+    _fresh: LastRow = field(default_factory=LastRow)  # that is not stale
     _silences: set[int] = field(default_factory=set)  # reported, by PLC time of the row before
     _unfit: int = 0  # quality bits that are set now
     _baseline: "Baseline" = field(init=False)  # figures of healthy cycles
@@ -225,9 +226,10 @@ class Monitor:
         if not len(samples):
             return
         if self._is_uneventful(samples):
-            self._last = self._fresh = samples[-1:].copy()
+            self._last.keep(samples)
+            self._fresh.keep(samples)
             return
-        rows = joined(self._fresh, self._last, samples)
+        rows = joined(self._fresh.row, self._last.row, samples)
         first = len(rows) - len(samples)
         quality = rows["quality"]
         changes = np.diff(quality & _UNFIT, prepend=np.uint8(self._unfit)) != 0
@@ -244,14 +246,14 @@ class Monitor:
             if row >= first:
                 last_fresh = rows[before[row]] if silent[row] else None
                 yield from self._row_events(rows[row - 1] if row else None, rows[row], last_fresh)  # pyright: ignore[reportArgumentType]
-        self._last = rows[-1:].copy()
-        self._fresh = rows[fresh][-1:].copy()
+        self._last.keep(samples)
+        self._fresh.keep(rows[fresh])
 
     def _is_uneventful(self, samples: Samples) -> bool:
         """Whether all rows are good, and there was no silence since the last fresh one."""
         if self._unfit or self._silences or samples["quality"].any():
             return False
-        came = np.concatenate([self._fresh["host_ns"], samples["host_ns"]])
+        came = np.concatenate([self._fresh.row["host_ns"], samples["host_ns"]])
         return int(np.diff(came).max(initial=0)) <= self.stale_ns
 
     def _row_events(

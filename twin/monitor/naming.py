@@ -23,11 +23,11 @@ from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import UNCERTAIN_LAWS, ways
-from twin.monitor.rows import drawn_rows, time_steps
+from twin.monitor.rows import drawn_rows, elapsed, time_steps
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import PER_UNIT
 from twin.monitor.surroundings import told
-from twin.signals import MBAR, NS, Samples, Ticks, deviation
+from twin.signals import MBAR, Samples, Ticks, deviation
 
 STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
@@ -228,8 +228,8 @@ class _Expected:
     def _expected(self, theta: Theta) -> Floats:
         """Pressure (Pa) at the drawn rows, (rows, n); ``theta`` is (coefficients, n)."""
         rows = self.drawn
-        breaks = time_steps(self.samples, None)[rows] < 0.0
-        dt = np.where(breaks, -1.0, np.diff(self.samples["time_ns"][rows], prepend=0) * NS)
+        breaks = time_steps(self.samples)[rows] < 0.0
+        dt = np.where(breaks, -1.0, elapsed(self.samples[rows]))
         dt[:1] = 0.0
         driven = dt, self.ticks["phase"][rows], self.ticks["level"][rows].astype(np.float64)
         state, expected = kernel.new_state(theta.shape[1]), np.empty((len(rows), theta.shape[1]))

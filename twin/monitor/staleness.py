@@ -15,7 +15,7 @@ import numpy as np
 
 from twin.events import Event, Kind
 from twin.monitor.monitor import Monitor
-from twin.signals import NS, Quality, Samples
+from twin.signals import NS, LastRow, Quality, Samples
 
 LONGEST_WAIT_NS = 500_000_000  # drivers give a block at least this often: else the host slept
 ONCE_NS = 60_000_000_000  # a twin that is late again within this time does not report it again
@@ -47,7 +47,7 @@ class Listening:
 
     clock: Callable[[], int] = time.perf_counter_ns  # monotonic
     notices: Notices = field(default_factory=Notices)
-    _last: Samples | None = None  # the last fresh row, as an array of one
+    _last: LastRow = field(default_factory=LastRow)  # that is not stale
     _heard_ns: int = 0  # its time of receipt, by ``clock``
     _listened_ns: int = 0  # since then
     _late_ns: int | None = field(default=None)  # last time at which the twin was late, by ``clock``
@@ -61,26 +61,26 @@ class Listening:
         while (block := next(blocks, None)) is not None:
             now_ns = self.clock()
             self._listened_ns += min(now_ns - asked_ns, LONGEST_WAIT_NS)
-            last = self._last
-            notices = [] if last is None else self.notices.taken(int(last["time_ns"][0]))
+            last = self._last.row
+            notices = self.notices.taken(int(last["time_ns"][0])) if len(last) else []
             rows, events = self._judge(block, monitor, now_ns)
             yield rows, notices + events
             asked_ns = self.clock()
 
     def _judge(self, block: Samples, monitor: Monitor, now_ns: int) -> tuple[Samples, list[Event]]:
         fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
-        last = self._last
+        last = self._last.row
         if not len(fresh):
-            stale = [] if last is None else monitor.silent(last[0], self._listened_ns)
-            return block, stale
+            return block, monitor.silent(last[0], self._listened_ns) if len(last) else []
         events: list[Event] = []
-        if last is not None and not monitor.is_stale(last[0]):
+        if len(last) and not monitor.is_stale(last[0]):
             first = fresh[:1]
             if (block["host_ns"][first] - last["host_ns"] > monitor.stale_ns).any():
                 block = block.copy()
                 block["quality"][first] |= Quality.OURS.value
             events = self._late(int(last["time_ns"][0]), now_ns, monitor.stale_ns)
-        self._last, self._heard_ns, self._listened_ns = block[fresh[-1:]].copy(), now_ns, 0
+        self._last.keep(block[fresh[-1:]])
+        self._heard_ns, self._listened_ns = now_ns, 0
         return block, events
 
     def _late(self, time_ns: int, now_ns: int, stale_ns: int) -> list[Event]:

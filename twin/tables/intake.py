@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.errors import SourceError
-from twin.signals import BREAK, SAMPLE, Quality, Samples
+from twin.signals import BREAK, LastRow, Quality, Samples
 from twin.tables.date_time import Calendar
 from twin.tables.decode import Batch, Spoilt, decode
 from twin.tables.layout import COMMANDS, DIGITS, REPORTED, Layout
@@ -51,7 +51,7 @@ class Intake:
     settings: ImportSettings
     ambient: float
     calendar: Calendar
-    _last: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))  # the last row taken
+    _last: LastRow = field(default_factory=LastRow)
     _period: int | None = None  # ns
 
     def __post_init__(self) -> None:
@@ -61,8 +61,8 @@ class Intake:
     def take(self, batch: Batch) -> Samples:
         """Give as many samples as there are rows; SourceError for the first one refused."""
         rows, bad = decode(batch, self.layout, self.ambient, self.calendar)
-        run = np.concatenate((self._last, rows))
-        rows = run[len(self._last) :]
+        run = np.concatenate((self._last.row, rows))
+        rows = run[len(self._last.row) :]
         self._replace(run, bad, batch)
         breaks = self._find_breaks(run)
         self._refuse(batch, bad, breaks)
@@ -70,7 +70,7 @@ class Intake:
         rows["quality"][breaks.clock] |= Quality.CLOCK.value
         rows["quality"][breaks.restart] |= Quality.RESTART.value
         rows["quality"][breaks.gap] |= Quality.GAP.value
-        self._last = rows[-1:].copy()
+        self._last.keep(rows)
         return rows
 
     # --- values that cannot be NaN continue from the row before ---------------------------------
@@ -122,7 +122,7 @@ class Intake:
         onward = (sequence[1:] > sequence[:-1]) | (Column.SEQUENCE not in self.layout.file_names)
         missing = (_distance(sequence) - np.uint64(1)).view(np.int64)
         marked = (run["quality"][1:] & BREAK) != 0
-        first = int(len(self._last) == 0)  # 1 if no row comes before
+        first = int(len(self._last.row) == 0)  # 1 if no row comes before
         return _Breaks(
             np.pad((times[1:] <= times[:-1]) & ~marked, (first, 0)),
             np.pad(~onward & ~marked, (first, 0)),
