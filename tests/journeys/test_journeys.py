@@ -231,3 +231,27 @@ def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
     figures = typed(tmp_path, "figures", "show", "Messung.mcap")
     assert "t0" in figures
     assert typed(tmp_path, "log", "check", "Messung.mcap")
+
+
+READ_OFF = """
+--id unit-9 --type unknown --address none --unit mbar --reference absolute --range 0,1500
+--hose-mm 2000 --diameter-mm 4 --end cups --volume-ml 125 --sensor ejector --released yes
+--supply-bar 5
+"""
+
+
+def test_an_unknown_rig_is_commissioned(tmp_path: Path) -> None:
+    rows = rigs.recorded("gripper", 16.0)[0][::2]
+    trace = [
+        f"{(row['time_ns'] - rows['time_ns'][0]) / 1e6:.0f},{row['commands'] & 1},"
+        f"{row['commands'] >> 1 & 1},{row['pressure'] / 100.0:.2f}\n"
+        for row in rows
+    ]
+    header = "time_ms,suction,blow_off,pressure_mbar\n"
+    (tmp_path / "trace.csv").write_text(header + "".join(trace))
+    written = typed(tmp_path, "init", "cell.toml", *READ_OFF.split())
+    assert "twin commission healthy.mcap --config cell.toml" in written
+    typed(tmp_path, "import", "trace.csv", "--config", "cell.toml", "-o", "healthy.mcap")
+    told = typed(tmp_path, "commission", "healthy.mcap", "--config", "cell.toml", "--id", "unit-9")
+    assert re.search(r"(?m)^(good|usable)\b", told)
+    assert "unit-9" in typed(tmp_path, "assets", "list", "--assets", "sqlite:///assets.sqlite")

@@ -4,6 +4,7 @@ The record itself shows noise, thresholds, ambient pressure if the system is ope
 and delays. The fit starts from these and searches the range of all ejectors on the market.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -31,6 +32,7 @@ from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.model.dataset import Ambient, DataSet, sensor_place
+from twin.model.gas import GAMMA, R
 from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.signal_checks import APART, Contradiction
@@ -68,6 +70,7 @@ ELSEWHERE, SURELY = 0.6, 4.0
 # of that.
 RELIEVED, RELIEVES = 60.0, 0.5
 CREEPS = 0.3  # first guess of the share of the cups' yielding that comes later
+FAR_WEAKER = 0.5  # of the guess of a blow-off, below which a fit does not reach the weaker one
 DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
@@ -166,7 +169,8 @@ def commission(
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
-    fitted = _fit(used, starts(guess, readings.meets, readings.grows), free, progress)
+    guesses = starts(guess, readings.meets, readings.grows, _into_hose(guess, readings))
+    fitted = _fit(used, guesses, free, progress)
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
@@ -359,9 +363,7 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
         ejector["suction_capacity_sl_min"] = float(np.clip(capacity, 1.0, 1000.0))
     blow_off = readings.blow_off(evacuated, ambient, ROOM_TEMPERATURE) / SL_MIN
     if np.isfinite(blow_off):
-        ejector["blow_off_sl_min"] = float(np.clip(blow_off, 1.0, 2000.0))
-        ejector["exhaust_sl_min"] = ejector["blow_off_sl_min"]
-        ejector["relief_sl_min"] = 0.3 * ejector["blow_off_sl_min"]
+        ejector.update(_blow_off(blow_off))
         ejector["blow_off_drain_per_s"] = DRAINS * readings.fill_rate
     highest = (readings.highest - ambient) / MBAR
     relieved = RELIEVES * highest if highest > RELIEVED else ejector["cracking_pressure_mbar"]
@@ -371,14 +373,43 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
         ejector["back_flow_sl_min"] = float(np.clip(back, 0.0, 2000.0))
 
 
-def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
+def _blow_off(flow: float) -> dict[str, float]:
+    """First guess of a blow-off of ``flow`` (sl/min), and of what it leaves through."""
+    flow = float(np.clip(flow, 1.0, 2000.0))
+    return {"blow_off_sl_min": flow, "exhaust_sl_min": flow, "relief_sl_min": 0.3 * flow}
+
+
+def _into_hose(data: DataSet, readings: Readings) -> float:
+    """Blow-off (sl/min) that lifts the pressure at a hose's end as far as the record shows.
+
+    A flow m into a hose lifts the pressure there by m c / A at once (its wave impedance), long
+    before what hangs on the hose is filled. NaN without a hose.
+    """
+    bores = [
+        volume(part) / (part.length_mm * 1e-3)
+        for part in data.system.parts
+        if isinstance(part, Tube)
+    ]
+    rise = data.ambient.pressure_mbar * MBAR - readings.deepest
+    speed_of_sound = math.sqrt(GAMMA * R * ROOM_TEMPERATURE)
+    return min(bores, default=np.nan) * rise / speed_of_sound / SL_MIN
+
+
+def starts(
+    data: DataSet, meets: float, grows: float = np.nan, into_hose: float = np.nan
+) -> list[DataSet]:
     """Starts of a fit: ``data`` in variants that no fit reaches from each other.
 
     They differ in the sensor's place along the line, the gas at the port, how a part leaves, and
     whether cups spread or fold. Cups may be on the next part when suction is commanded, or meet it
     ``meets`` seconds later (NaN: not shown by the record). If the fall ``grows`` slowly (s), the
-    jet may be the reason, or the sensor.
+    jet may be the reason, or the sensor. If a blow-off ``into_hose`` (sl/min) is far weaker than
+    one that fills all, the pressure may show the hose alone.
     """
+    as_guessed = {key: getattr(data.ejector, key) for key in _blow_off(1.0)}
+    flows = [as_guessed]
+    if into_hose < FAR_WEAKER * data.ejector.blow_off_sl_min:
+        flows.append(_blow_off(into_hose))
     cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
     leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
     comes = meets / MS if np.isfinite(meets) else COMES
@@ -398,7 +429,9 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
     if slow is not quick:
         inside.append((PORT_SHARES[0], usual_wall, quick))
     guesses = []
-    for wait, leaving, place, (share, wall, jet) in product(waits, leaves, PLACES, inside):
+    for flow, wait, leaving, place, (share, wall, jet) in product(
+        flows, waits, leaves, PLACES, inside
+    ):
         shrinks, softness, stiff = wall
         port = share * total_volume
         tables["system"].update(
@@ -406,7 +439,7 @@ def starts(data: DataSet, meets: float, grows: float = np.nan) -> list[DataSet]:
         )
         tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or total_volume))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
-        tables["ejector"].update(jet, port_volume_ml=port)
+        tables["ejector"].update(jet, port_volume_ml=port, **flow)
         guesses.append(DataSet.model_validate(tables))
     return guesses
 
