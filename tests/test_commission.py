@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rigs
 from calibrations import log_of, quiet, typed
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +17,6 @@ from second_world.faults import Fault
 from second_world.records import Record as Logged
 from second_world.records import record
 
-from drivers.plc.settings import PlcSettings
 from twin.assets.database_url import open_chosen
 from twin.calibration.calibrate import complete
 from twin.calibration.commission import (
@@ -316,16 +314,6 @@ def test_a_fit_starts_with_a_weak_blow_off_where_a_hose_alone_may_show() -> None
     assert flows == {strong, weak}
     for near_or_none in (0.7 * strong, np.nan):
         assert len(starts(data, np.nan, into_hose=near_or_none)) == len(starts(data, np.nan))
-
-
-def test_a_blow_off_into_a_long_hose_is_followed() -> None:
-    """The sensor at the ejector rises in 10 ms, as if a strong blow-off had filled all cups."""
-    samples, _ = rigs.recorded("gripper", 16.0, seed=1)
-    found = commission(typed("gripper"), [samples], quiet)
-    assert found.verdict.word == "good"
-    blow_off = found.calibration.fitted.data.ejector.blow_off_sl_min
-    truth = rigs.config("gripper").document.section(PlcSettings, "plc").ejector.blow_off_sl_min
-    assert blow_off == pytest.approx(truth, rel=0.3)
 
 
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:

@@ -235,13 +235,13 @@ def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
 
 READ_OFF = """
 --id unit-9 --type unknown --address none --unit mbar --reference absolute --range 0,1500
---hose-mm 2000 --diameter-mm 4 --end cups --volume-ml 125 --sensor ejector --released yes
+--hose-mm 100 --diameter-mm 6 --end vessel --volume-ml 800 --sensor unknown --released no
 --supply-bar 5
 """
 
 
 def test_an_unknown_rig_is_commissioned(tmp_path: Path) -> None:
-    rows = rigs.recorded("gripper", 16.0)[0][::2]
+    rows = rigs.recorded("test_rig", 60.0)[0][::2]
     trace = [
         f"{(row['time_ns'] - rows['time_ns'][0]) / 1e6:.0f},{row['commands'] & 1},"
         f"{row['commands'] >> 1 & 1},{row['pressure'] / 100.0:.2f}\n"
