@@ -575,9 +575,10 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         ]
         alternatives = fit(evidence, weights, without) if without[0] else []
         without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
-        gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
         if found.effects == (WEATHER,):
             gains = [_weather_gain(evidence, unseen, found.hypothesis)]
+        else:
+            gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(found)
         if (
