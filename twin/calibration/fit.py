@@ -73,6 +73,8 @@ NARROWING = (
     Round(2, 0.3, 0.6 * MBAR, 20, 1e-3),
     Round(1, 1.0, 0.6 * MBAR, 40, 1e-4),
 )
+# The end of that, once more from its result: with a wide error a search leaves a local end.
+AGAIN = NARROWING[3:]
 # Sigmas beyond which the robust loss grows more slowly than the square of a residual.
 ROBUST = 8.0
 
@@ -265,13 +267,14 @@ def fit_from_afar(
     spaces = [Space.of_market(guess, free) for guess in guesses]
     starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
     for number, fit_round in enumerate(NARROWING, 1):
-        starts = starts[: fit_round.starts]
+        starts = _kept(starts, fit_round.starts)
         progress(f"fitting, round {number} of {len(NARROWING)}: {len(starts)} starts")
         rows = samples[: round(len(samples) * fit_round.share)]
         starts = sorted(
             (_followed(rows, start, fit_round, noises) for start in starts), key=attrgetter("cost")
         )
-    best, both_noises = starts[0], noises + second_noise(samples)
+    best = _again(samples, starts[0], noises, progress)
+    both_noises = noises + second_noise(samples)
     if len(both_noises) > 1:
         progress("following the second pressure as well")
         with_second = _followed(samples, best, NARROWING[-1], both_noises)
@@ -286,6 +289,31 @@ def fit_from_afar(
     pressure = samples["pressure"][(samples["quality"] & UNUSABLE) == 0]
     deepest = float(np.nanquantile(pressure, DEEPEST))
     return replace(_fitted(problem, best.x), deepest=deepest)
+
+
+def _kept(starts: Sequence[_Start], count: int) -> list[_Start]:
+    """The ``count`` best of ``starts``, and among two or more the best by each way a part leaves.
+
+    No search turns one way into the other, and early rounds hardly tell them apart.
+    """
+    if count < 2:
+        return list(starts[:count])
+    ways = [start.data.system.part_leaves for start in starts]
+    best = [ways.index(way) for way in dict.fromkeys(ways)]
+    others = [number for number in range(len(starts)) if number not in best]
+    return [starts[number] for number in sorted((best + others)[:count])]
+
+
+def _again(
+    samples: Samples, best: _Start, noises: Sequence[float], progress: Callable[[str], None]
+) -> _Start:
+    """The better of ``best`` and of where its last rounds end if they begin from it."""
+    progress("fitting again from the result")
+    again = best
+    for fit_round in AGAIN:
+        rows = samples[: round(len(samples) * fit_round.share)]
+        again = _followed(rows, again, fit_round, noises)
+    return min(best, again, key=attrgetter("cost"))
 
 
 def second_noise(samples: Samples) -> list[float]:

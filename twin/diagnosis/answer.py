@@ -226,7 +226,8 @@ def _with_unlisted(
     far its waveform may be off, counts in sigmas alone.
     """
     limit = MIMICS if len(findings.causes) == 1 else LITTLE
-    if findings.verdict == "explained" and findings.after.rms > limit * before.usual:
+    usual = math.hypot(before.usual, findings.after.unmeasured)
+    if findings.verdict == "explained" and findings.after.rms > limit * usual:
         mechanism_alone = explain_alone(evidence, fitted, findings.causes, progress)
         mechanism, mended = _on_unseen(evidence, mechanism_alone, findings.after, held_out)
         if mended is None or mended.leftover >= findings.after.leftover:

@@ -32,7 +32,9 @@ CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
 KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
 # Columns of ``moved`` for that: knees of a cycle are independent.
 KNEES = [len(SCATTER) + len(_CLOSES), -1]
-UNSEEN = 3.0  # sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set
+# Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
+# seen any of another day's.
+UNSEEN = 3.0
 _INTO = (Phase.HOLD, Phase.SUCTION)  # phase that begins at each of LEVELS
 LEVEL_MBAR = 0.5  # sigma of a switching level, common to all cycles
 
@@ -68,6 +70,7 @@ class Covariance:
     mismatch: Floats  # one sigma of the error in what is explained, in each bin
     moves: Floats  # by one sigma of each scatter, (bins, scatters)
     left_open: Floats  # by one sigma of each uncertainty of the data set, first and second order
+    of_the_day: Floats  # 1 for each column of ``left_open`` that is about the log's day, else 0
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
         """Weights of some cycles; not ``scattered``: without the scatter of effects."""
@@ -82,7 +85,8 @@ class Covariance:
         ]
         variance = np.concatenate([np.empty(0), *map(np.diag, groups)]) + common**2
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
-        unseen = left_open**2 * (left_open**2 > UNSEEN**2 * variance[:, None])
+        large = left_open**2 > UNSEEN**2 * variance[:, None]
+        unseen = left_open**2 * np.maximum(large, self.of_the_day)
         unmeasured = _row_rms(np.sum(unseen, axis=1), bins.count[rows], 0.0)
         moves, prior = _in_common(bins, rows, common, left_open)
         groups = [group * evidence.healthy.leftover**2 for group in groups]
@@ -145,7 +149,9 @@ def covariance(
     uncertain = (*evidence.uncertain, *_another_day(evidence, ambient))
     off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
-    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open)
+    of_the_day = np.arange(len(uncertain)) >= len(evidence.uncertain)
+    columns = np.tile(of_the_day.astype(np.float64), 1 + both_ways)
+    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open, columns)
 
 
 def _farthest_ambient(evidence: Evidence, about: Hypothesis) -> float:

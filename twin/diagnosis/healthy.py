@@ -34,7 +34,12 @@ class _HealthyDeviation:
         """Covariance of bins with the learned error and scatter."""
         evidence = replace(self.evidence, healthy=healthy)
         _, moves, _ = moved(evidence, HEALTHY, scatter(evidence))
-        return Covariance(evidence, np.zeros_like(self.off), moves, self.left_open)
+        return self.about(evidence, moves)
+
+    def about(self, evidence: Evidence, moves: Floats) -> Covariance:
+        """Covariance of bins with these changes by scatter."""
+        nothing = np.zeros(self.left_open.shape[1])  # healthy cycles are of the calibration's day
+        return Covariance(evidence, np.zeros_like(self.off), moves, self.left_open, nothing)
 
 
 def learned(evidence: Evidence) -> Healthy:
@@ -118,7 +123,7 @@ def _amplitudes(
     evidence, moves = replace(deviation.evidence, healthy=healthy), deviation.moves
     size = (evidence.cycles, moves.shape[1])
     amplitudes, spread = np.zeros(size), np.zeros(size)
-    model = Covariance(evidence, np.zeros_like(deviation.off), moves, deviation.left_open)
+    model = deviation.about(evidence, moves)
     known_sizes = [healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()]
     prior = np.ones(moves.shape[1])
     prior[: len(known_sizes)] = known_sizes
