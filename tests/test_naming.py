@@ -49,3 +49,12 @@ def test_time_that_stands_still_or_jumps_is_drawn() -> None:
     odd = np.flatnonzero((dt < 0.0005) | (dt > 0.0015))
     assert len(odd)
     assert np.isin(odd, drawn_rows(samples, ticks)).all()
+
+
+@pytest.mark.parametrize("fault", ["weak_blow_off=85.0", "blow_off_delay=250.0"])
+def test_a_blow_off_that_hardly_acts_is_not_weather(fault: str) -> None:
+    # Cups that stay on the part leave the idle pressure low, by more than any weather.
+    theta, samples, ticks = beside("gripper", fault)
+    healthy = rigs.config("gripper").monitor.healthy
+    first = likenesses(theta, healthy, samples, ticks, BEGIN)[:1]
+    assert [cause.effect for cause in first] != ["ambient_pressure"]

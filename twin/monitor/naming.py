@@ -16,7 +16,7 @@ from twin.inference.priors import penalty
 from twin.inference.sensitivities import coefficients_at, derivatives
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model import kernel
-from twin.model.effects import EFFECTS, UNKNOWN, Effect
+from twin.model.effects import EFFECTS, UNKNOWN, WEATHER, Effect
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
@@ -33,6 +33,7 @@ STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
 NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 NOISE = 1.0  # mbar, of a row. Chosen: what is named here is far larger
+MOST_WEATHER = 5.0  # typical sizes of weather: 75 mbar. At no place does the air differ by more
 EXPLAINED = 0.5  # of the squares, that a name takes away at least: more than it leaves
 
 
@@ -74,6 +75,8 @@ def likenesses(
     rest = np.array([cycle.squares(cycle.off - moves) for moves in moved.T])
     # What a law leaves open must not do the explaining.
     left[rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off)] = np.inf
+    is_weather = np.array([effect.name == WEATHER for effect in effects])
+    left[is_weather & (np.abs(sizes) > MOST_WEATHER)] = np.inf
     best = int(np.argmin(left))
     if np.isinf(left[best]):
         return []
