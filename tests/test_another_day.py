@@ -113,6 +113,19 @@ def test_weather_moves_h1_where_the_ejector_s_own_sensor_counts_from_zero(rig: s
     assert shift["low95"] < -25.0 < shift["high95"]
 
 
+def test_what_another_day_leaves_open_counts_wholly_in_mbar() -> None:
+    """It grows with the weather from the first mbar on, however small beside the scatter."""
+    evidence = collected()
+
+    def open_squared(shift: float) -> float:
+        about = (Cause("ambient_pressure", {"shift": shift}),) if shift else HEALTHY
+        return covariance(evidence, about).of(evidence.judged).unmeasured ** 2
+
+    same_day = open_squared(0.0)  # the temperature is open on any day
+    small, large = open_squared(2.0) - same_day, open_squared(8.0) - same_day
+    assert large / small == pytest.approx(16.0, rel=0.3)
+
+
 # --- gauge sensors --------------------------------------------------------------------------------
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rigs
 from calibrations import log_of, quiet, typed
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,7 +33,7 @@ from twin.calibration.commission import (
     within,
 )
 from twin.calibration.cycles import Cycles
-from twin.calibration.fit import BENDS, BEST_END, END_PRESSURE, falling
+from twin.calibration.fit import BENDS, BEST_END, END_PRESSURE, _kept, _Start, falling
 from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.page import write_page
 from twin.calibration.parameters import (
@@ -314,6 +315,26 @@ def test_a_fit_starts_with_a_weak_blow_off_where_a_hose_alone_may_show() -> None
     assert flows == {strong, weak}
     for near_or_none in (0.7 * strong, np.nan):
         assert len(starts(data, np.nan, into_hose=near_or_none)) == len(starts(data, np.nan))
+
+
+def test_a_fit_keeps_both_ways_in_which_a_part_leaves() -> None:
+    """They cost nearly the same while the model's error counts as wide."""
+    data, begun = typed("gripper").data, list[_Start]()
+    for cost, way in enumerate(["after_blow_off"] * 3 + ["in_blow_off"], 8):
+        system = data.system.model_copy(update={"part_leaves": way})
+        space = Space.of_market(data.model_copy(update={"system": system}))
+        begun.append(_Start(space, np.zeros(len(space.free)), cost))
+    assert [start.cost for start in _kept(begun, 2)] == [8, 11]
+    assert [start.cost for start in _kept(begun, 3)] == [8, 9, 11]
+    assert [start.cost for start in _kept(begun, 1)] == [8]
+
+
+def test_the_shipped_gripper_is_followed_through_its_hose() -> None:
+    """Its sensor is at the ejector, and its cups are behind two metres of hose."""
+    samples, _ = rigs.recorded("gripper", 16.0, seed=1)
+    commissioned = commission(typed("gripper"), [samples], quiet)
+    assert commissioned.verdict.word != "refused"
+    assert commissioned.calibration.fitted.data.ejector.blow_off_sl_min < 90.0  # 60 in the rig
 
 
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:
