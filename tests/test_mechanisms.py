@@ -22,7 +22,7 @@ from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.extend import extended, nothing, remarks
 from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
-from twin.diagnosis.propose import Proposal, proposed
+from twin.diagnosis.propose import Proposal, _range, proposed
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
 from twin.model import kernel
@@ -207,6 +207,17 @@ def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> No
     assert judged is not None
     assert judged["gain"]["share_of_achievable_pct"] > 80.0
     assert judged["extended"]["rms_mbar"] < judged["baseline"]["rms_mbar"]
+
+
+def test_the_phase_of_a_swing_is_proposed_for_no_other_log() -> None:
+    mechanism = m.MECHANISMS["supply_swinging"]
+    shown = {"low95": 0.1, "high95": 0.3}
+    ranges = {
+        parameter.name: _range(mechanism, parameter, 0.2, shown)
+        for parameter in mechanism.when.parameters
+    }
+    assert ranges["period"]["high"] < 1.0
+    assert (ranges["shift"]["low"], ranges["shift"]["high"]) == (0.0, 120.0)
 
 
 def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:

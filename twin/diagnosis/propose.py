@@ -129,11 +129,12 @@ def _range(
 ) -> dict[str, float]:
     """Range of a parameter: a size up to its bound in that direction, a shape about its value.
 
-    If the log does not show a shape, its range is as wide as its bounds.
+    If the log does not show a shape, or the shape is of this log alone, its range is as wide as its
+    bounds.
     """
     if parameter in mechanism.place.parameters:
         low, high = (0.0, parameter.high) if value >= 0.0 else (parameter.low, 0.0)
-    elif answered is None or value <= 0.0:
+    elif answered is None or value <= 0.0 or parameter.is_of_the_log:
         low, high = parameter.low, parameter.high
     else:
         low = max(min(answered["low95"], value / OTHERWISE), parameter.low)

@@ -37,6 +37,7 @@ class Parameter:
     coefficient: int | None = None
     ratio: bool = False  # what matters is how many times as large it is: a time constant
     usual: float | None = None  # of what shapes an effect that was seen before
+    is_of_the_log: bool = False  # a phase: another log has another one
     # Of an estimate, one sigma: from the scale of the data set, that is, of volume and suction.
     relative_error: float = 0.03
 

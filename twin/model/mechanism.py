@@ -75,7 +75,7 @@ _BELOW = _P("ends_below", "mbar", 1.0, 400.0, 2.0, ratio=True)
 _SETS_IN = _P("sets_in", "s", 0.02, 600.0, 1.5, ratio=True)
 _FADES = _P("fades", "s", 0.02, 600.0, 1.5, ratio=True)
 _PERIOD = _P("period", "s", 0.2, 120.0, 1.1, ratio=True)
-_SHIFT = _P("shift", "s", 0.0, 120.0, 0.2)
+_SHIFT = _P("shift", "s", 0.0, 120.0, 0.2, is_of_the_log=True)
 
 PLACES = {
     place.name: place
