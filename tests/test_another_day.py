@@ -113,15 +113,15 @@ def test_weather_moves_h1_where_the_ejector_s_own_sensor_counts_from_zero(rig: s
     assert shift["low95"] < -25.0 < shift["high95"]
 
 
-def test_what_another_day_leaves_open_counts_wholly_in_mbar() -> None:
-    """It grows with the weather from the first mbar on, however small beside the scatter."""
+def test_what_another_weather_leaves_open_counts_wholly_in_mbar() -> None:
+    """It grows from the first mbar on, however small beside the scatter; temperature adds to it."""
     evidence = collected()
 
     def open_squared(shift: float) -> float:
-        about = (Cause("ambient_pressure", {"shift": shift}),) if shift else HEALTHY
+        about = (Cause("ambient_pressure", {"shift": shift}),)
         return covariance(evidence, about).of(evidence.judged).unmeasured ** 2
 
-    same_day = open_squared(0.0)  # the temperature is open on any day
+    same_day = open_squared(0.0)
     small, large = open_squared(2.0) - same_day, open_squared(8.0) - same_day
     assert large / small == pytest.approx(16.0, rel=0.3)
 

@@ -226,7 +226,8 @@ def _with_unlisted(
     far its waveform may be off, counts in sigmas alone.
     """
     limit = MIMICS if len(findings.causes) == 1 else LITTLE
-    usual = math.hypot(before.usual, findings.after.unmeasured)
+    opened = math.sqrt(max(findings.after.unmeasured**2 - before.unmeasured**2, 0.0))
+    usual = math.hypot(before.usual, opened)
     if findings.verdict == "explained" and findings.after.rms > limit * usual:
         mechanism_alone = explain_alone(evidence, fitted, findings.causes, progress)
         mechanism, mended = _on_unseen(evidence, mechanism_alone, findings.after, held_out)

@@ -17,6 +17,7 @@ from twin.inference.sensitivities import central, derivatives
 from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c
 from twin.model.courses import Cause, Course, Schedule
+from twin.model.effects import WEATHER
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
 from twin.monitor.bins import Bins, Floats, Ints
@@ -33,7 +34,7 @@ KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
 # Columns of ``moved`` for that: knees of a cycle are independent.
 KNEES = [len(SCATTER) + len(_CLOSES), -1]
 # Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
-# seen any of another day's.
+# seen any of what another weather leaves open.
 UNSEEN = 3.0
 _INTO = (Phase.HOLD, Phase.SUCTION)  # phase that begins at each of LEVELS
 LEVEL_MBAR = 0.5  # sigma of a switching level, common to all cycles
@@ -70,7 +71,7 @@ class Covariance:
     mismatch: Floats  # one sigma of the error in what is explained, in each bin
     moves: Floats  # by one sigma of each scatter, (bins, scatters)
     left_open: Floats  # by one sigma of each uncertainty of the data set, first and second order
-    of_the_day: Floats  # 1 for each column of ``left_open`` that is about the log's day, else 0
+    of_weather: Floats  # 1 for each column of ``left_open`` that is open by a weather, else 0
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
         """Weights of some cycles; not ``scattered``: without the scatter of effects."""
@@ -86,7 +87,7 @@ class Covariance:
         variance = np.concatenate([np.empty(0), *map(np.diag, groups)]) + common**2
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
         large = left_open**2 > UNSEEN**2 * variance[:, None]
-        unseen = left_open**2 * np.maximum(large, self.of_the_day)
+        unseen = left_open**2 * np.maximum(large, self.of_weather)
         unmeasured = _row_rms(np.sum(unseen, axis=1), bins.count[rows], 0.0)
         moves, prior = _in_common(bins, rows, common, left_open)
         groups = [group * evidence.healthy.leftover**2 for group in groups]
@@ -150,7 +151,8 @@ def covariance(
     off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
     of_the_day = np.arange(len(uncertain)) >= len(evidence.uncertain)
-    columns = np.tile(of_the_day.astype(np.float64), 1 + both_ways)
+    is_weather = any(cause.effect == WEATHER for cause in about)
+    columns = np.tile(of_the_day * float(is_weather), 1 + both_ways)
     return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open, columns)
 
 
