@@ -72,6 +72,10 @@ clean:  ## take away what was made here
 	$(BIN)/python -m compileall -q twin drivers
 	touch $@
 
+.venv/service: .venv/run requirements-service.lock
+	$(PIP) --require-hashes -r requirements-service.lock
+	touch $@
+
 .venv/dev: .venv/run requirements-dev.lock
 	$(PIP) --require-hashes -r requirements-dev.lock
 	touch $@

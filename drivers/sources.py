@@ -11,6 +11,7 @@ from drivers.modbus.settings import ModbusSettings
 from drivers.probe import Line
 from drivers.reconnect import Away
 from twin.errors import ConfigError, SourceError
+from twin.extras import require
 from twin.settings import Document
 from twin.signals import Samples
 
@@ -38,6 +39,7 @@ def open_source(
     settings = settings_of(document, address)
     if isinstance(settings, ModbusSettings):
         return modbus.blocks(settings, lines=lines, away=away, known=known)
+    require("opcua", "a PLC over OPC UA")
     from drivers.opcua import source as opcua  # noqa: PLC0415 - the library takes its time
 
     return opcua.blocks(settings, away=away, known=known)
@@ -62,6 +64,7 @@ def probe_source(document: Document, address: str = "") -> Iterator[str]:
 def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
     if isinstance(settings, ModbusSettings):
         return probe(settings)
+    require("opcua", "a PLC over OPC UA")
     from drivers.opcua import probe as opcua_probe  # noqa: PLC0415 - the library takes its time
 
     return opcua_probe.probe(settings)
@@ -88,6 +91,6 @@ def _configured(document: Document) -> "ModbusSettings | OpcuaSettings":
     folder = Path(document.name).parent  # files lie there, wherever the program was started
     if kind == "modbus":
         return document.section(ModbusSettings, "driver").below(folder)
-    from drivers.opcua.settings import OpcuaSettings  # noqa: PLC0415 - as above
+    from drivers.opcua.settings import OpcuaSettings  # noqa: PLC0415 - of a protocol in use
 
     return document.section(OpcuaSettings, "driver").below(folder)

@@ -374,8 +374,6 @@ def test_without_the_library_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "twin.exchange.aas")
-    monkeypatch.delattr("twin.exchange.aas", raising=False)
     monkeypatch.setitem(sys.modules, "basyx.aas", None)
     assert twin(monkeypatch, "assets", "export", "--aasx", "a.aasx") == 2
     assert install_hint("aas") in capsys.readouterr().err

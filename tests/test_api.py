@@ -31,6 +31,8 @@ from twin.calibration.readings import read
 from twin.calibration.verdict import Residual, Verdict
 from twin.config import Config
 from twin.diagnosis.curves import outline
+from twin.errors import ConfigError
+from twin.extras import install_hint
 from twin.figures.table import FIGURES
 from twin.hil import Plant
 from twin.log.reader import open_log
@@ -247,13 +249,11 @@ def test_a_frame_has_the_columns(tutorial: Read) -> None:
         assert np.array_equal(frame[name], column, equal_nan=column.dtype.kind == "f"), name
 
 
-def test_without_pandas_it_says_what_to_install(
-    tutorial: Read, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pandas_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(twin.TwinError) as refused:
-        tutorial.names["healthy"].frame()
-    assert "[notebook]" in refused.value.hint
+    with pytest.raises(ConfigError, match=r"^twin\.open needs the extra") as refused:
+        _ = twin.open
+    assert refused.value.hint == install_hint("notebook")
 
 
 # What a notebook shows.

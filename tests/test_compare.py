@@ -20,8 +20,7 @@ from twin.compare.compare import (
     compare,
     interval,
 )
-from twin.compare.picture import bins, difference
-from twin.compare.side import BIN_S, Curve, Side, side_of, whole
+from twin.compare.side import BIN_S, Curve, Side, bins, difference, side_of, whole
 from twin.compare.text import conclusion, in_words, plain, remarks
 from twin.figures.cycle import KeyFigures
 from twin.figures.table import FIGURES

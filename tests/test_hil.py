@@ -27,7 +27,7 @@ from drivers.modbus import source as modbus
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.hil import HilSettings, RegisterOutlet
 from drivers.modbus.settings import ModbusSettings
-from drivers.opcua.hil import HilSettings as OpcuaHilSettings
+from drivers.opcua.hil_settings import HilSettings as OpcuaHilSettings
 from drivers.outputs.writer import Outputs, Writer
 from drivers.plc.partner import LONGEST_PICK, NO_PART, PATIENCE, TRIPPED, PartnerTask
 from drivers.plc.settings import PlcSettings

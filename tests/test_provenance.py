@@ -19,6 +19,7 @@ import hatchling.build
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from test_extras import DECLARED, packages_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "docs", "drivers", "tests", "tools", "twin")
@@ -129,17 +130,29 @@ def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> 
 # --- imports and declarations -------------------------------------------------------------------
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-EXTRAS = PROJECT["project"]["optional-dependencies"]
+EXTRAS = {extra: [*map(str, packages_of(extra))] for extra in DECLARED}
 # What imports a package, and what it is installed with beside the base. One that is not here has
 # the base alone.
 NEEDS_EXTRA = {
+    "drivers/opcua/": "opcua",
+    "drivers/outputs/conditions.py": "opcua",
+    "drivers/outputs/nodes.py": "opcua",
+    "drivers/outputs/serve.py": "opcua",
+    "drivers/plc/opcua": "opcua",
+    "twin/alarms/export.py": "tables",
     "twin/api.py": "notebook",
-    "twin/cli/serve.py": "serve",
+    "twin/compare/picture.py": "reports",
+    "twin/diagnosis/": "reports",
     "twin/exchange/aas.py": "aas",
     "twin/exchange/elements.py": "aas",
     "twin/exchange/fmu_file.py": "aas",
     "twin/exchange/submodels.py": "aas",
+    "twin/figures/export.py": "tables",
+    "twin/figures/picture.py": "reports",
     "twin/fleet/engines.py": "dask",
+    "twin/fleet/text.py": "fleet",
+    "twin/paper/picture.py": "reports",
+    "twin/tables/": "tables",
     "twin/catalogues.py": "serve",
     "twin/page/": "serve",
     "twin/view.py": "view",
@@ -218,7 +231,8 @@ def test_what_is_declared_is_imported() -> None:
         for name, _ in imported(path)
         for distribution in providers.get(name, [])
     }
-    loaded_by_name = {"psycopg"}  # SQLAlchemy's, for postgresql+psycopg
+    # SQLAlchemy loads it for postgresql+psycopg, and uvicorn for WebSockets.
+    loaded_by_name = {"psycopg", "websockets"}
     wanted = declared(
         [*PROJECT["project"]["dependencies"], *(r for of in EXTRAS.values() for r in of)]
     )

@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from drivers.modbus import hil as hil_modbus
 from drivers.modbus.settings import ModbusSettings
-from drivers.opcua import hil as hil_opcua
+from drivers.opcua.hil_settings import HilSettings as OpcuaHilSettings
 from drivers.opcua.settings import OpcuaSettings
 from drivers.outputs.settings import ResultsSettings
 from drivers.plc.settings import PlcSettings
@@ -220,7 +220,7 @@ def settings_of(table: str, given: dict[str, Any]) -> type[Settings]:
         return {"modbus": ModbusSettings, "opcua": OpcuaSettings}[given.get("kind", "modbus")]
     if table == "hil":
         over_opcua = "node" in given["tags"]["pressure"]
-        return (hil_opcua if over_opcua else hil_modbus).HilSettings
+        return OpcuaHilSettings if over_opcua else hil_modbus.HilSettings
     return TABLES_OF[table]
 
 
@@ -326,7 +326,7 @@ def test_a_page_has_every_key_of_the_driver_with_its_default(page: str) -> None:
         ("docs/outlets.md", WebhookSettings),
         ("docs/outlets.md", NotificationSettings),
         ("docs/hil.md docs/connect-your-plc.md", hil_modbus.HilSettings),
-        ("docs/hil.md docs/opcua.md", hil_opcua.HilSettings),
+        ("docs/hil.md docs/opcua.md", OpcuaHilSettings),
         ("docs/page.md", PageSettings),
     ],
     ids=lambda one: one if isinstance(one, str) else one.__name__,

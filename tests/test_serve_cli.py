@@ -28,6 +28,7 @@ from twin.cli.serve import live_rows_of, reports_of
 from twin.diagnosis import __main__ as diagnosing
 from twin.diagnosis import process, report
 from twin.diagnosis.process import LiveDiagnosis
+from twin.extras import install_hint
 from twin.page.ejector import REPORT
 from twin.page.ring import read
 from twin.page.settings import RING, folder_of
@@ -107,7 +108,7 @@ def test_what_cannot_be_served_is_said(
 def test_a_run_leaves_rows_and_reports_only_where_it_is_asked_to(tmp_path: Path) -> None:
     silent = rigs.config("gripper")
     assert live_rows_of(silent, pytest.fail) is None
-    assert reports_of(silent) is None
+    assert reports_of(silent, pytest.fail) is None
     settings = config(write_config(tmp_path))
     opened = live_rows_of(settings, pytest.fail)
     assert opened is not None
@@ -117,7 +118,18 @@ def test_a_run_leaves_rows_and_reports_only_where_it_is_asked_to(tmp_path: Path)
     folder = folder_of(settings.document, settings.asset)
     assert folder == tmp_path / "page" / "compact-ejector-35.gripper-01"
     assert read(folder / RING) is not None
-    assert reports_of(settings) == folder / "reports"
+    assert reports_of(settings, pytest.fail) == folder / "reports"
+
+
+def test_without_matplotlib_a_run_says_that_it_leaves_no_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    said: list[str] = []
+    assert reports_of(config(write_config(tmp_path)), said.append) is None
+    (remark,) = said
+    assert "the extra [reports]" in remark
+    assert remark.endswith(install_hint("reports"))
 
 
 def test_an_answer_says_where_it_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Writes the lock files from pyproject.toml: what runs the twin, what develops it, what audits it.
+# Writes the lock files from pyproject.toml: what the demo, a service, development and audit run on.
 # Hashes are kept and no index is named, so a mirror or a folder of wheels serves as well.
 set -eu
 cd "$(dirname "$0")/.."
@@ -9,7 +9,9 @@ lock() {
     uv pip compile "$@" --universal --python-version 3.11 --generate-hashes \
         --no-emit-index-url --no-annotate --no-header --quiet --output-file "$out"
 }
-lock requirements.lock pyproject.toml --group build
-lock requirements-dev.lock pyproject.toml --extra aas --extra dask --extra notebook --extra serve --extra view \
-    --group build --group dev --group docs --constraint requirements.lock
+lock requirements.lock pyproject.toml --extra reports --group build
+lock requirements-service.lock pyproject.toml --constraint requirements.lock --group build \
+    --extra opcua --extra postgres --extra reports --extra serve
+lock requirements-dev.lock pyproject.toml --constraint requirements.lock --all-extras \
+    --group build --group dev --group docs
 lock requirements-audit.lock --group audit --constraint requirements-dev.lock

@@ -41,7 +41,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from twin import api  # noqa: PLC0415  (with its first use)
+    from twin.extras import require  # noqa: PLC0415  (with its first use)
+
+    require("notebook", f"twin.{name}")
+    from twin import api  # noqa: PLC0415  (as above)
 
     return getattr(api, name)
 

@@ -42,7 +42,6 @@ from twin.diagnosis.drawing import Picture
 from twin.diagnosis.text import listed, spoken
 from twin.errors import ConfigError
 from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
-from twin.extras import install_hint
 from twin.figures.cycle import compiled as key_figures
 from twin.hil import Plant
 from twin.languages import language_of
@@ -145,14 +144,9 @@ class Log:
         return Compared(compare_sides(ours, theirs))
 
     def frame(self) -> Any:
-        """The columns as a ``pandas.DataFrame``; ConfigError if pandas is not installed."""
-        try:
-            from pandas import DataFrame  # noqa: PLC0415  (an extra)
-        except ImportError as error:
-            raise ConfigError(
-                f"a DataFrame needs pandas, which is not installed: {error}",
-                f"{install_hint('notebook')}, or take columns()",
-            ) from error
+        """The columns as a ``pandas.DataFrame``."""
+        from pandas import DataFrame  # noqa: PLC0415  (it takes its time)
+
         return DataFrame(dict(self.columns()))
 
     def cycles(self) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from twin.errors import ConfigError, known_names
-from twin.extras import install_hint
+from twin.extras import require
 from twin.language import ENGLISH, Language
 
 
@@ -14,12 +14,9 @@ def language_of(code: str, name: str) -> Language:
     """
     if code == ENGLISH.code:
         return ENGLISH
-    try:
-        from twin.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
-    except ImportError as error:
-        raise ConfigError(
-            f'{name} "{code}" needs a package that is not installed', install_hint("serve")
-        ) from error
+    require("serve", f'{name} "{code}"', "babel")
+    from twin.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
+
     languages = Catalogues().languages
     if code not in languages:
         raise ConfigError(f'{name}: there are no texts in "{code}"', known_names(code, languages))

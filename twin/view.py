@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind, Severity
-from twin.extras import install_hint
+from twin.extras import install_hint, require
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.signals import (
     BREAK,
@@ -332,13 +332,8 @@ class _Viewer:
 
 def import_rerun() -> Any:
     """The optional package; if it is missing, ConfigError says what to install."""
-    try:
-        return importlib.import_module("rerun")
-    except ImportError as error:
-        raise ConfigError(
-            f"the view needs Rerun, which is not installed: {error}",
-            install_hint("view"),
-        ) from error
+    require("view", "the view")
+    return importlib.import_module("rerun")
 
 
 def _executable() -> str:

@@ -1,59 +1,13 @@
 """Hardware in the loop over OPC UA: outputs as nodes, all by one request."""
 
-from typing import Self
-
-from pydantic import Field, model_validator
-
 from drivers.opcua.client import OpcuaClient
-from drivers.opcua.settings import Node, NodeName, NodePressure, OpcuaSettings
-from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
+from drivers.opcua.hil_settings import HilSettings, HilTags
+from drivers.opcua.settings import Node, OpcuaSettings
+from drivers.outputs.writer import Outputs, Ranged, Writer, counted
 from drivers.reconnect import REAL
 from twin.errors import ConfigError
-from twin.settings import Document, Settings
+from twin.settings import Document
 from twin.signals import MBAR
-
-
-class Signal(Settings):
-    """A signal that is written, as the type of its node: a Boolean, or 0 and 1."""
-
-    node: NodeName  # as of other tags
-
-
-class Counter(Settings):
-    """The watchdog: counts up with each block, and from the high end on from the low one."""
-
-    node: NodeName  # as of other tags
-    range: tuple[int, int] = (0, 32_767)  # it counts from the first to the last, again and again
-
-    @model_validator(mode="after")
-    def _counts(self) -> Self:
-        refuse_empty(self.range)
-        return self
-
-
-class WrittenPressure(NodePressure):
-    """The pressure as the PLC expects it, within ``range``."""
-
-    @model_validator(mode="after")
-    def _can_be_written(self) -> Self:
-        refuse_no_range(self.range)
-        return self
-
-
-class HilTags(Settings):
-    """What may be written; what is not listed never is."""
-
-    pressure: WrittenPressure | None = None
-    part_present: Signal | None = None  # H2
-    air_saving: Signal | None = None  # H1
-    watchdog: Counter | None = None
-
-
-class HilSettings(Settings):
-    """The ``[hil]`` table beside an OPC UA ``[driver]``."""
-
-    min_interval_ms: float = Field(default=10.0, ge=1, le=1000)  # between two writes
-    tags: HilTags
 
 
 class NodeOutlet:

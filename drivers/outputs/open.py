@@ -11,6 +11,7 @@ from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.writer import Writer
 from drivers.sources import settings_of
 from twin.errors import ConfigError
+from twin.extras import require
 from twin.settings import Document
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def open_writer(
         from drivers.modbus import hil as hil_modbus  # noqa: PLC0415 - each protocol when it is needed
 
         return hil_modbus.writer(settings, document, lines)
+    require("opcua", "a PLC over OPC UA")
     from drivers.opcua import hil as hil_opcua  # noqa: PLC0415 - the library takes its time
 
     return hil_opcua.writer(settings, document)
@@ -52,6 +54,7 @@ def open_results(
     if settings is None:
         yield None
         return
+    require("opcua", "[results] over OPC UA")
     from drivers.outputs.results import ResultsServer  # noqa: PLC0415 - the library takes its time
 
     with ResultsServer(settings, figures) as server:

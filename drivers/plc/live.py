@@ -16,6 +16,7 @@ from drivers.plc.registers import Registers
 from drivers.plc.scan import PERIOD_NS, Scans, Task
 from drivers.plc.server import listening
 from drivers.plc.settings import PlcSettings
+from twin.extras import require
 
 if TYPE_CHECKING:
     from drivers.plc.opcua import Serving
@@ -143,6 +144,7 @@ async def _opcua(
     if settings is None:
         yield None
         return
+    require("opcua", "[plc.opcua]")
     from drivers.plc.opcua import serving  # noqa: PLC0415 - the library takes its time
 
     async with serving(memories, settings, catch_up) as opcua:

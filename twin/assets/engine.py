@@ -30,6 +30,7 @@ from sqlalchemy.pool import ConnectionPoolEntry, NullPool, StaticPool
 
 from twin.assets.configured import DatabaseSettings
 from twin.errors import ConfigError, SourceError
+from twin.extras import require
 from twin.secret import refuse_password
 
 
@@ -197,6 +198,7 @@ def make_engine(url: URL, busy_s: float) -> Engine:
         )
         event.listen(engine, "connect", _prepare_sqlite)
     else:
+        require("postgres", shown(url))
         query = {"connect_timeout": str(max(2, math.ceil(busy_s)))}  # libpq's minimum is 2 s
         url = url.update_query_dict({**query, **url.query})
         engine = create_engine(url, pool_pre_ping=True, execution_options=options)

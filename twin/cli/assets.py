@@ -14,7 +14,7 @@ from twin.cli.app import App, read_config, say_if_new
 from twin.cli.options import AASX, FMU, JSON, chosen, written_as
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError, known_names
-from twin.extras import install_hint
+from twin.extras import require
 from twin.files import write_whole
 
 if TYPE_CHECKING:
@@ -329,21 +329,14 @@ def _only_fmu(file: Path, fmus: Mapping[str, bytes]) -> bytes:
 
 def _shells() -> "ModuleType":
     """The module for Asset Administration Shells; ConfigError if its library is not installed."""
-    try:
-        from twin.exchange import aas
-    except ImportError as error:
-        raise _not_installed(error) from error
+    require("aas", "an Asset Administration Shell")
+    from twin.exchange import aas
+
     return aas
 
 
 def _read_fmu(path: Path) -> "Fmu":
-    try:
-        from twin.exchange.fmu_file import read_fmu
-    except ImportError as error:
-        raise _not_installed(error) from error
+    require("aas", "an FMU of a shell")
+    from twin.exchange.fmu_file import read_fmu
+
     return read_fmu(path)
-
-
-def _not_installed(error: ImportError) -> ConfigError:
-    text = f"shells need the Eclipse BaSyx SDK, which is not installed: {error}"
-    return ConfigError(text, install_hint("aas"))

@@ -83,7 +83,6 @@ def commission(
     corrects it where they differ. The verdict is good, usable or refused (exit code 2).
     """
     from twin.calibration.commission import commission as fit_unit
-    from twin.calibration.page import write_page
     from twin.calibration.report import commissioned_as_json, commissioned_in_words
     from twin.calibration.save import store_first
     from twin.config import Config, document_in
@@ -122,6 +121,8 @@ def commission(
     if json_file is not None:
         write_json(json_file, commissioned_as_json(commissioned, settings.asset, record))
     if report is not None:
+        from twin.calibration.page import write_page  # with Matplotlib
+
         write_page(commissioned, settings.asset, report)
     if record is None:
         raise typer.Exit(2)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from twin.extras import require
 from twin.files import said_plainly
 
 
@@ -13,6 +14,7 @@ def cert(
     name: Annotated[str, typer.Option(help="Of this application, for people.")] = "ejector-twin",
 ) -> None:
     """Make a certificate and key of our own, beside folders for those we trust."""
+    require("opcua", "twin cert")
     from drivers.opcua import certificates
 
     with said_plainly(folder):

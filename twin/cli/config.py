@@ -51,7 +51,7 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
     """The tables of a configuration by name, each with its settings by kind of driver or ""."""
     from drivers.modbus import hil as hil_modbus
     from drivers.modbus.settings import ModbusSettings
-    from drivers.opcua import hil as hil_opcua
+    from drivers.opcua.hil_settings import HilSettings as HilOverOpcua
     from drivers.opcua.settings import OpcuaSettings
     from drivers.outputs.settings import ResultsSettings
     from drivers.plc.settings import PlcSettings
@@ -86,7 +86,7 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
         "outlets": {"": OutletsSettings},
         "results": {"": ResultsSettings},
         "assets": {"": AssetsSettings},
-        "hil": {"modbus": hil_modbus.HilSettings, "opcua": hil_opcua.HilSettings},
+        "hil": {"modbus": hil_modbus.HilSettings, "opcua": HilOverOpcua},
         "plc": {"": PlcSettings},
     }
 

@@ -60,11 +60,9 @@ def show(
     from twin.assets.unit import Unit
     from twin.figures.curve import stretches, volume_of
     from twin.figures.database import open_store
-    from twin.figures.export import to_table
     from twin.figures.read import of_log
     from twin.figures.text import curve_plain, curve_table, cycles_table
     from twin.log.reader import open_log
-    from twin.tables.sheet import export as export_table
 
     if figures and not keep:
         raise ConfigError("--figures is for --keep", "say --keep as well, or leave it out")
@@ -88,6 +86,9 @@ def show(
             content["commands"] = recorded.header.derived
         write_json(json_file, content)
     if table is not None:
+        from twin.figures.export import to_table
+        from twin.tables.sheet import export as export_table
+
         with open_store("sqlite://") as store:
             store.add(unit, data_set, log.name, plain)
             export_table(to_table(store.history(unit), unit), table)
@@ -108,8 +109,6 @@ def costs(
     """Air, energy and money of each day of a log, and of a year at its rate."""
     from twin.figures.costs import days, year
     from twin.figures.costs_text import days_plain, days_table
-    from twin.figures.export import days_columns
-    from twin.tables.sheet import export as export_table
 
     json_file = chosen_file(output, "--json", json_file, JSON)
     table = chosen_file(output, "", None, *TABLES)
@@ -123,6 +122,9 @@ def costs(
     if json_file is not None:
         write_json(json_file, {"log": str(log), **days_plain(by_day, whole, tariff)})
     if table is not None:
+        from twin.figures.export import days_columns
+        from twin.tables.sheet import export as export_table
+
         export_table(days_columns(by_day, tariff), table)
 
 

@@ -16,6 +16,7 @@ from twin.cli.options import JSON, PAGE, JsonAlone, JsonFile, written_as
 from twin.cli.options import chosen as chosen_file
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError
+from twin.extras import require
 from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
@@ -114,12 +115,13 @@ def report(
     from twin.fleet.report import Refused
     from twin.fleet.report import report as put_together
     from twin.fleet.results_database import open_store
-    from twin.fleet.text import in_words, write_page
 
     json_file = chosen_file(output, "--json", json_file, JSON)
     page = chosen_file(output, "--html", page, PAGE)
     require_writable(json_file, page)
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
+    from twin.fleet.text import in_words, write_page  # with Matplotlib, which the engine requires
+
     fleet = _Fleet.of(config, assets, to_store=bool(files))
     outcomes = _done("replay", files, fleet, workers_of) if files else []
     with open_store(fleet.assets) as store, open_assets(fleet.assets) as database:
@@ -149,7 +151,8 @@ class _Engine:
     workers: int | None
 
     def __post_init__(self) -> None:
-        """ConfigError for options that do not fit together."""
+        """ConfigError for options that do not fit together, or without the extra."""
+        require("fleet", "twin fleet")
         if self.name is EngineName.LOCAL:
             if self.scheduler:
                 raise ConfigError("a scheduler is Dask's", "add --engine dask")

@@ -7,12 +7,20 @@ from typing import Annotated, Any
 import typer
 
 from twin.errors import ConfigError
+from twin.extras import require
 from twin.files import require_ending
 
 JSON, PAGE, RRD, AASX, TOML = ".json", ".html", ".rrd", ".aasx", ".toml"
 TABLES, PICTURES = (".csv", ".parquet", ".xlsx"), (".svg", ".png")
 LOG, FMU, SSP = ".mcap", ".fmu", ".ssp"
 ALL_ENDINGS = (JSON, PAGE, RRD, AASX, TOML, *TABLES, *PICTURES, LOG, FMU, SSP, ".pdf", ".txt")
+
+_EXTRAS = {  # that write a format
+    **dict.fromkeys((PAGE, *PICTURES), "reports"),
+    **dict.fromkeys(TABLES, "tables"),
+    RRD: "view",
+    AASX: "aas",
+}
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML configuration.")]
 ConfigFiles = Annotated[
@@ -36,11 +44,14 @@ FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was rai
 
 
 def strictly(*endings: str) -> Callable[[Path | None], Path | None]:
-    """Callback of an option whose file's ending decides: ConfigError unless it is one of these."""
+    """Callback of an option whose file's ending decides.
+
+    ConfigError unless it is one of these, or if what writes it is not installed.
+    """
 
     def checked(path: Path | None) -> Path | None:
         if path is not None:
-            require_ending(path, *endings)
+            _require_writer(require_ending(path, *endings), path)
         return path
 
     return checked
@@ -56,15 +67,23 @@ def output(*endings: str) -> Any:
 def written_as(*endings: str) -> Callable[[Path | None], Path | None]:
     """Callback of an option that names the format: ConfigError if the ending names another one.
 
-    Any other name is accepted: of a temporary file, or of a pipe.
+    Any other name is accepted: of a temporary file, or of a pipe. It is also a ConfigError if what
+    writes the format is not installed.
     """
 
     def checked(path: Path | None) -> Path | None:
-        if path is not None and path.suffix.lower() in ALL_ENDINGS:
-            require_ending(path, *endings)
+        if path is not None:
+            is_named = path.suffix.lower() in ALL_ENDINGS
+            _require_writer(require_ending(path, *endings) if is_named else endings[0], path)
         return path
 
     return checked
+
+
+def _require_writer(ending: str, path: Path) -> None:
+    """ConfigError unless the extra is installed that writes files of an ending."""
+    if extra := _EXTRAS.get(ending):
+        require(extra, f"writing {path}")
 
 
 def chosen(output: Path | None, option: str, named: Path | None, *endings: str) -> Path | None:

@@ -133,7 +133,7 @@ def run(
             closing.enter_context(
                 _retained(settings, opened.get("log"), plc.listening.notices, complain)
             )
-            adviser = _diagnosing(settings, file, stopped, alone=alone)
+            adviser = _diagnosing(settings, file, stopped, complain, alone=alone)
             # With --hil nothing is measured, so nothing is diagnosed. Alarms come last: they use
             # the diagnosis.
             enrichers: dict[str, EventEnricher] = (
@@ -328,7 +328,12 @@ def _retained(
 
 
 def _diagnosing(
-    settings: "Config", log: Path | None, stopped: Callable[[], str], *, alone: bool
+    settings: "Config",
+    log: Path | None,
+    stopped: Callable[[], str],
+    complain: Callable[[str], None],
+    *,
+    alone: bool,
 ) -> "EventEnricher":
     """The enricher that has alarms of a live run diagnosed."""
     from twin.diagnosis.process import LiveDiagnosis
@@ -338,7 +343,7 @@ def _diagnosing(
         str(log or "live"),
         lambda: stopped() == "interrupted",
         status if alone else no_status,
-        reports=reports_of(settings),
+        reports=reports_of(settings, complain),
     )
 
 

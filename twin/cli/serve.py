@@ -10,7 +10,7 @@ import typer
 from twin.cli.app import read_config
 from twin.cli.console import complain
 from twin.errors import ConfigError
-from twin.extras import install_hint
+from twin.extras import require
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -65,7 +65,7 @@ def serve(
     needs a login (twin users), and so does everything where others reach it. With --broker
     it shows what all ejectors publish, beside those of --config or alone.
     """
-    _require_extra()
+    require("serve", "twin serve")
     from twin.config import Config
     from twin.page.server import Place
     from twin.settings import Document
@@ -131,17 +131,6 @@ def _serve(
         server.run(sockets=[listening])
 
 
-def _require_extra() -> None:
-    """ConfigError if the page's libraries are not installed."""
-    try:
-        import babel  # noqa: F401
-        import starlette  # noqa: F401
-        import uvicorn  # noqa: F401
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(f"twin serve needs {error.name}", install_hint("serve")) from error
-
-
 def _require_users(endpoint: "Place", users: "Users") -> None:
     """ConfigError if a page without users would be reachable from the network."""
     if endpoint.is_loopback:
@@ -187,10 +176,18 @@ def live_rows_of(
     return opened
 
 
-def reports_of(settings: "Config") -> Path | None:
-    """The folder for reports of live diagnoses; None unless ``[page]`` asks for them."""
+def reports_of(settings: "Config", say: "Callable[[str], None]") -> Path | None:
+    """The folder for reports of live diagnoses; None unless ``[page]`` asks for them.
+
+    Without the extra for reports the run goes on without them, and says so.
+    """
     from twin.page.settings import REPORTS, PageSettings, folder_of
 
     if not settings.document.section(PageSettings, "page").keep:
+        return None
+    try:
+        require("reports", "a report of a live diagnosis")
+    except ConfigError as missing:
+        say(f"{missing}\n  {missing.hint}")
         return None
     return folder_of(settings.document, settings.asset) / REPORTS

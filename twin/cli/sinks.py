@@ -9,6 +9,7 @@ from threading import Lock
 from typing import TYPE_CHECKING
 
 from twin.errors import ConfigError
+from twin.extras import require
 
 if TYPE_CHECKING:
     from twin.config import Config
@@ -37,6 +38,8 @@ def views_of(
     """Give a function that returns the opener of an ejector's view; all share a window or file."""
     if view and rrd is not None:
         raise ConfigError("--view and --rrd exclude each other", "open the file: rerun FILE.rrd")
+    if view or rrd is not None:
+        require("view", "the view")
     one_at_a_time, alone = Lock(), len(ejectors) == 1
     with ExitStack() as closing:
 

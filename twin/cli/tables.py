@@ -17,6 +17,7 @@ from twin.cli.setup import configured, pair_of
 from twin.cli.sinks import open_sinks
 from twin.cli.stopping import leave, stop_on_signal, until
 from twin.errors import SourceError
+from twin.extras import require
 
 if TYPE_CHECKING:
     from twin.tables.reader import Table
@@ -58,6 +59,7 @@ def import_(
     ] = False,
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
+    require("tables", "twin import")
     from twin.live import run as run_loop
     from twin.log.header import DERIVED
     from twin.log.part import refuse_other_suffix

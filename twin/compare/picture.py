@@ -7,10 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from twin.compare.compare import Comparison
-from twin.compare.side import BIN_S, LONGEST_S, Curve, Floats, Side
+from twin.compare.side import Curve, Floats, Side, bins, difference
 from twin.compare.text import conclusion
 from twin.diagnosis.drawing import Picture, empty, write_picture
-from twin.inference.levels import SIGMAS_95
 
 COLOURS = {"A": "#0a62a8", "B": "#c8500a"}
 TITLE = 130  # characters in a line
@@ -41,12 +40,6 @@ def write(comparison: Comparison, path: Path) -> None:
     write_picture(draw(comparison), path)
 
 
-def bins() -> Floats:
-    """Time of each bin since the suction edge (s)."""
-    count = round(LONGEST_S / BIN_S)
-    return np.linspace(0.0, LONGEST_S, count, endpoint=False) + 0.5 * BIN_S
-
-
 def _draw_vacuum(axes: Axes, label: str, side: Side) -> None:
     name = f"{label}: {side.name}, {len(side.cycles)} cycles"
     _band(axes, side.measured_vacuum, COLOURS[label], name)
@@ -64,13 +57,6 @@ def _draw_difference(axes: Axes, comparison: Comparison) -> None:
     axes.plot(time, mean, color="0.1", lw=1.3, label="B − A, measured vacuum (band: 95 %)")
     time, expected, _ = difference(comparison.a.expected_vacuum, comparison.b.expected_vacuum)
     axes.plot(time, expected, "--", color="0.45", lw=1.2, label="B − A, expected vacuum")
-
-
-def difference(a: Curve, b: Curve) -> tuple[Floats, Floats, Floats]:
-    """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both exist."""
-    is_finite = np.isfinite(a.mean) & np.isfinite(b.mean)
-    error = np.hypot(a.error, b.error)
-    return bins()[is_finite], (b.mean - a.mean)[is_finite], SIGMAS_95 * error[is_finite]
 
 
 def _band(axes: Axes, curve: Curve, colour: str, label: str) -> None:

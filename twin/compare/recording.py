@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from twin.compare.compare import Comparison
-from twin.compare.picture import bins, difference
-from twin.compare.side import Curve, Floats
+from twin.compare.side import Curve, Floats, bins, difference
 from twin.compare.text import conclusion, remarks
 from twin.errors import SourceError
 from twin.signals import NS

@@ -12,6 +12,7 @@ from twin.config import Config
 from twin.errors import SourceError
 from twin.figures.curve import Stretch, readings, stretches, volume_of
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
+from twin.inference.levels import SIGMAS_95
 from twin.log.header import LogHeader
 from twin.model import theta as c
 from twin.model.dataset import coefficients
@@ -65,6 +66,19 @@ class Curve:
         """Standard error of the mean in each bin; NaN where the mean is."""
         error: Floats = self.spread / np.sqrt(np.maximum(self._sums[0], 1.0))
         return error
+
+
+def bins() -> Floats:
+    """Time of each bin since the suction edge (s)."""
+    count = round(LONGEST_S / BIN_S)
+    return np.linspace(0.0, LONGEST_S, count, endpoint=False) + 0.5 * BIN_S
+
+
+def difference(a: Curve, b: Curve) -> tuple[Floats, Floats, Floats]:
+    """Time (s), difference of the means B − A (mbar) and half its 95 % band, where both exist."""
+    is_finite = np.isfinite(a.mean) & np.isfinite(b.mean)
+    error = np.hypot(a.error, b.error)
+    return bins()[is_finite], (b.mean - a.mean)[is_finite], SIGMAS_95 * error[is_finite]
 
 
 @dataclass

@@ -14,14 +14,13 @@ from urllib.parse import urlsplit
 
 from pebble import ProcessExpired, ProcessPool
 
-from twin.errors import ConfigError, SourceError
-from twin.extras import install_hint
+from twin.errors import SourceError
+from twin.extras import require
 from twin.fleet.tasks import Done, Job
 
 Submit = Callable[[Callable[[Job], Done], Job], Future[Done]]
 CONNECT_S = 10.0
 PORT = 8786  # Dask's
-_MISSING = f"{install_hint('dask')}, or take --engine local"
 
 
 def cores() -> int:
@@ -46,10 +45,9 @@ def local(workers: int) -> Iterator[Submit]:
 @contextmanager
 def dask(scheduler: str) -> Iterator[Submit]:
     """The workers of the scheduler at an address; ConfigError if Dask is not installed."""
-    try:
-        from distributed import Client  # noqa: PLC0415  # an extra
-    except ImportError as error:
-        raise ConfigError(f"a Dask cluster needs Dask, not installed: {error}", _MISSING) from error
+    require("dask", "a Dask cluster")
+    from distributed import Client  # noqa: PLC0415  # an extra
+
     address = urlsplit(scheduler)
     try:  # test the address first: a client that fails to connect leaves a thread behind
         socket.create_connection((address.hostname or "", address.port or PORT), CONNECT_S).close()
