@@ -8,16 +8,19 @@ import os
 import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Callable
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import hatchling.build
 import pytest
 import rigs
 from packaging.utils import canonicalize_name
 from plc_process import PlcProcess
 
 from tools.audit import needs_of, reached
+from twin.cli.init import STARTERS
 from twin.errors import ConfigError
 from twin.extras import install_hint
 from twin.log.reader import open_log
@@ -48,13 +51,11 @@ def modules_of_no_base() -> set[str]:
     }
 
 
-@pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Runs a program as the base installation does."""
-    folder = tmp_path_factory.mktemp("base")
+def base_in(folder: Path, root: Path) -> Run:
+    """Runs the program of ``root`` in a folder, as the base installation does."""
     missing = modules_of_no_base() - {"twin", "drivers", "coverage"}
     (folder / "sitecustomize.py").write_text(f"NOT_THERE = {missing!r}\n{ONLY}")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(rigs.ROOT)])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(root)])}
 
     def run(*arguments: str | Path, code: str = "") -> "subprocess.CompletedProcess[str]":
         what = ["-c", code] if code else ["-m", "twin.cli", *map(str, arguments)]
@@ -68,6 +69,23 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Run:
         )
 
     return run
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return base_in(tmp_path_factory.mktemp("base"), rigs.ROOT)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Runs what is in the wheel, away from the checkout."""
+    folder, root = tmp_path_factory.mktemp("away"), tmp_path_factory.mktemp("wheel")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(rigs.ROOT)
+        name = hatchling.build.build_wheel(str(root))
+    with zipfile.ZipFile(root / name) as archive:
+        archive.extractall(root)
+    return base_in(folder, root)
 
 
 def done(process: "subprocess.CompletedProcess[str]") -> str:
@@ -104,6 +122,21 @@ def test_a_run_beside_a_plc(base: Run, plc: PlcProcess, tmp_path: Path) -> None:
     assert "scan" in done(base("probe", GRIPPER, *address))
     done(base("run", GRIPPER, *address, "--log", tmp_path / "a.mcap", "--duration", "2"))
     assert sum(len(rows) for rows, _ in open_log(tmp_path / "a.mcap").blocks()) > 1000
+
+
+@pytest.mark.parametrize("name", STARTERS)
+def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: Run) -> None:
+    assert str(rigs.ROOT) not in done(wheel(code="import twin; print(twin.__file__)"))
+    assert f"twin plc {name}.toml" in done(wheel("init", f"{name}.toml", "--starter", name))
+    assert "no mistake" in done(wheel("config", "check", f"{name}.toml"))
+
+
+def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
+    done(wheel("init", "rig.toml", "--starter", "gripper"))
+    assert "listening" in done(wheel("plc", "rig.toml", "--port", "0", "--duration", "0.1"))
+    options = ("--address", f"127.0.0.1:{plc.port}", "--duration", "1", "--log", "a.mcap")
+    done(wheel("run", "rig.toml", *options))
+    assert "state: complete" in done(wheel("log", "check", "a.mcap"))
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import rigs
 from command_line import twin
 
 from drivers.sources import settings_of
+from twin.cli.init import STARTERS
 from twin.config import Config
 from twin.settings import Document
 from twin.tables.layout import BESIDE, REPORTED
@@ -179,3 +181,35 @@ def test_what_is_wrong_is_said_and_nothing_is_written(
     assert twin(monkeypatch, "init", *MODBUS, "--ring", "--suction", "coil:7") == 2
     assert "driver.tags.suction" in capsys.readouterr().err
     assert list(here.iterdir()) == []
+
+
+# Examples.
+
+
+@pytest.mark.parametrize("name", STARTERS)
+def test_an_example_is_written_as_it_is_shipped(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "init", "--starter", name) == 0
+    assert Path("cell.toml").read_bytes() == rigs.path_of(name).read_bytes()
+    *_, first, second = capsys.readouterr().out.splitlines()
+    assert first.strip() == "twin plc cell.toml"
+    assert second.strip().startswith("twin run cell.toml --log today.mcap ")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--starter", "test_rigg"), "did you mean 'test_rig'?"),
+        (("--starter", "gripper", "--volume-ml", "60"), "--volume-ml does not change an example"),
+    ],
+)
+def test_an_example_that_there_is_not_or_that_is_to_be_changed_is_refused(
+    options: tuple[str, ...],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, "init", *options) == 2
+    assert said in capsys.readouterr().err
+    assert not Path("cell.toml").exists()

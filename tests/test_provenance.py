@@ -100,6 +100,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]
 def test_a_wheel_has_the_packages_whole_and_one_licence(wheel: zipfile.ZipFile) -> None:
     inside = [*files(ROOT / "twin"), *files(ROOT / "drivers")]
     expected = {one.relative_to(ROOT).as_posix() for one in inside}
+    expected |= {f"twin/starters/{one.name}" for one in (ROOT / "configs").glob("*.toml")}
     shipped = set(wheel.namelist())
     (metadata,) = (one for one in shipped if one.endswith(".dist-info/METADATA"))
     assert {one for one in shipped if ".dist-info/" not in one} == expected
@@ -123,6 +124,7 @@ def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> 
         name = hatchling.build.build_sdist(str(tmp_path))
     with tarfile.open(tmp_path / name) as archive:
         inside = {one.name.split("/", 1)[1] for one in archive if one.isfile()}
+    assert "twin/starters/test_rig.toml" in inside
     others = {one for one in inside if not one.startswith(("twin/", "drivers/"))}
     assert others == {".gitignore", "LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
 

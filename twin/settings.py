@@ -58,7 +58,7 @@ class Document:
             raise SourceError(message, "check the path") from error
         except UnicodeDecodeError as error:
             message = f"{path}: not a text file, so not TOML"
-            raise SourceError(message, "name a file like those in configs/") from error
+            raise SourceError(message, "twin init FILE.toml writes one") from error
 
     @classmethod
     def parse(cls, text: str, name: str) -> "Document":

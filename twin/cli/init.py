@@ -13,9 +13,11 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError, SourceError, known_names
 from twin.files import said_plainly
 
+_STARTERS = Path(__file__).parents[1] / "starters"
+STARTERS = tuple(sorted(path.stem for path in _STARTERS.glob("*.toml")))
 UNKNOWN = "unknown"
 NO_PLC = "none"
 FILE_ONLY, PLACEHOLDER = "none: there are only files", "192.168.0.10:502"
@@ -245,10 +247,14 @@ def _size(flag: str, help_text: str) -> Any:
 
 
 def init(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The new configuration.")] = Path(
         "cell.toml"
     ),
     *,
+    starter: Annotated[
+        str, typer.Option(metavar="NAME", help=f"Copy an example: {', '.join(STARTERS)}.")
+    ] = "",
     unit: Annotated[
         str | None, typer.Option("--id", metavar="ID", help="Name of the unit.")
     ] = None,
@@ -299,11 +305,21 @@ def init(
     """Write a commented configuration to begin with, from flags or a few questions.
 
     On a terminal what no flag says is asked; unknown is an answer to most. Elsewhere it is
-    guessed, and the file says so. A file that is there is not overwritten.
+    guessed, and the file says so. A file that is there is not overwritten. An example has its
+    simulated PLC with it, so it can be tried without a machine.
     """
     if file.exists():
         message = f"{file}: there is already a file of that name"
         raise SourceError(message, "choose another name, or remove it")
+    if starter:
+        _refuse_other_options(context, "file", "starter")
+        _write(
+            file,
+            _example(starter),
+            f"twin plc {file}",
+            f"twin run {file} --log today.mcap   # in a second terminal",
+        )
+        return
     questions = Questions()
     ask = questions.ask
     named = ask("--id", unit, "Name of this unit", file.stem, str)
@@ -336,11 +352,35 @@ def init(
         file, (named, typed), connection, pressure_meaning, system, questions.guessed
     )
     _check(text, file)
+    _write(file, text, *next_commands(file, connection))
+
+
+def _write(file: Path, text: str, *commands: str) -> None:
+    """Write a new file, and print the commands to run next."""
     with said_plainly(file), file.open("x", encoding="utf-8") as stream:
         stream.write(text)
     print(f"written: {file}; look through it, then:")
-    for line in next_commands(file, connection):
+    for line in commands:
         print(f"  {line}")
+
+
+def _example(name: str) -> str:
+    """The text of a shipped configuration; ConfigError if there is none of that name."""
+    if name not in STARTERS:
+        raise ConfigError(
+            f"--starter {name}: there is no such example", known_names(name, STARTERS)
+        )
+    return (_STARTERS / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def _refuse_other_options(context: typer.Context, *allowed: str) -> None:
+    """ConfigError if more is given than is ``allowed``: an example is copied as it is."""
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        source = context.get_parameter_source(name)
+        if name not in allowed and source is not None and source.name == "COMMANDLINE":
+            message = f"{parameter.opts[0]} does not change an example"
+            raise ConfigError(message, "leave it out, and edit the file")
 
 
 def _of(choices: type[StrEnum]) -> str:

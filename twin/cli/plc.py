@@ -38,7 +38,7 @@ def plc(
         if "plc" not in document.tables:
             raise ConfigError(
                 f"{document.name}: there is no [plc] table",
-                "say what is simulated, as configs/test_rig.toml does",
+                "say what is simulated, as in: twin init FILE.toml --starter test_rig",
             )
     settings = [document.section(PlcSettings, "plc").on_port(port) for document in documents]
     run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
