@@ -219,6 +219,33 @@ def test_the_plant_of_a_plc_is_there_before_it_is_asked() -> None:
     models.take("gripper")
 
 
+# A start with all compiled.
+
+LATER = {  # what no start needs, by what does need it
+    "scipy.stats": "trends",
+    "scipy.optimize": "the naming of a deviation",
+    "asyncua": "OPC UA",
+    "matplotlib": "reports",
+    "pyarrow": "tables",
+    "starlette": "the page",
+    "pandas": "notebooks",
+}
+
+
+def test_a_start_imports_nothing_that_it_does_not_need(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    log = tmp_path / "a.mcap"
+    with started(*beside(plc, log, 0.5)) as process:
+        _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert len(logged(log)[0]) > 0
+    imported = {line.rpartition("|")[2].strip() for line in said.splitlines()}
+    assert {"numba", "twin.log.recorder"} <= imported
+    assert imported & {*LATER} == set()
+
+
 # The compiler itself.
 
 

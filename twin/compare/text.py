@@ -6,6 +6,7 @@ from typing import Any
 
 from twin.compare.compare import FEWEST, Comparison, Quantity, Values
 from twin.compare.side import Side
+from twin.figures.table import NO_DASH
 
 FORMAT = "ejector-twin-compare/1"
 NAMED = 3  # in the conclusion
@@ -20,7 +21,6 @@ FOLLOWS = (  # figures that follow from others; they come after them
     "quick_switchings",
 )
 HEADER = ("figure", "unit", "A (expected)", "B (expected)", "B − A", "95 %", "")
-NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}
 
 
 def in_words(comparison: Comparison) -> str:

@@ -19,6 +19,7 @@ FREE_SUCTION_S = 1.0  # at least, for a free-flow vacuum
 STEADY = 10.0  # mbar/s: a free-flow vacuum moves by less at the end of suction
 LEAST_FREE_FLOW = 5.0  # mbar: less cannot be told from zero
 UNKNOWN = math.nan
+NO_DASH = {"-": "", "0 or 1": "", "0 to 3": ""}  # units that no text states
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from twin.inference.covariance import Floats
 from twin.inference.sensitivities import derivatives, inside, points
@@ -75,6 +74,8 @@ class Descent:
         low = np.maximum(self.low - self.x, -LONGEST) - 1e-9
         high = np.minimum(self.high - self.x, LONGEST) + 1e-9
         r = np.concatenate([r, DAMPING * np.eye(len(low))])
+        from scipy.optimize import lsq_linear  # noqa: PLC0415 - a start needs no optimizer
+
         step = lsq_linear(r, -np.concatenate([projection, np.zeros(len(low))]), (low, high)).x
         gain = float(projection @ projection - np.sum((projection + r[: len(low)] @ step) ** 2))
         self.next = np.clip(self.x + step, self.low, self.high)

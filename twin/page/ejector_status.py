@@ -15,7 +15,7 @@ from twin.alarms.state import Alarm, State
 from twin.alarms.text import action_of
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import Times, capital, certainty, ends, number, plain_words, spoken, when
-from twin.figures.text import NO_DASH
+from twin.figures.table import NO_DASH
 from twin.instants import instant, lasting
 from twin.language import ENGLISH, language_code, numeral, tr
 from twin.model.effects import EFFECTS, UNKNOWN
