@@ -17,6 +17,7 @@ from twin.fleet.report import Refused, Report, State, report
 from twin.fleet.results_database import Key, Result
 from twin.fleet.text import headline, in_words, write_page
 from twin.fleet.type_statistics import estimates
+from twin.languages import language_of
 
 EFFECTS = {"leakage": "sl/min", "suction_loss": "%", "sensor_offset": "mbar"}
 STEP = 0.1  # of size, in a sigma
@@ -337,3 +338,40 @@ def test_the_page_is_whole_and_escaped(some: Report, tmp_path: Path) -> None:
     assert "http://" not in text.replace("http://www.w3.org", "")
     with pytest.raises(SourceError, match="cannot be written"):
         write_page(some, tmp_path / "absent" / "fleet.html")
+
+
+def some_of_all() -> Report:
+    """Units in each state, one that drifts, one that stepped, and a log that is none."""
+    rng = np.random.default_rng(6)
+    units = fleet(rng, 30)
+    units[4]["leakage"] = 40.0
+    results = [watched(f"<U{n}>", one) for n, one in enumerate(units)]
+    for day in range(0, 200, 10):
+        for number in range(FEWEST_PEERS):
+            sigmas = {name: float(rng.normal(0.0, 1.0)) for name in EFFECTS}
+            sigmas["leakage"] += 0.3 * day if number == 7 else 0.0
+            sigmas["suction_loss"] += 30.0 * (number == 6 and day >= 100)
+            results.append(watched(f"gripper-{number:02d}", sigmas, float(day)))
+    unanswered = {"verdict": "insufficient", "causes": [], "baseline": {"rms_mbar": None}}
+    reason = "only 3 cycles can be judged: record at least 4 complete ones in a row"
+    results += [
+        watched("few", {"leakage": 9.0}, kind="other"),
+        replace(result("diagnose", "cut", diagnosis("unlisted"), kind="other"), complete=False),
+        result("diagnose", "two", diagnosis("explained", "leakage", "weak_blow_off"), kind="other"),
+        result("diagnose", "why", unanswered | {"next_experiment": reason}, kind="other"),
+        result("replay", "empty", {"effects": {}}, kind="other"),
+    ]
+    records = [calibrated("U1", 35.0, 0.1), calibrated("U2", 35.5, 0.1)]
+    refused = [Refused("bad.mcap", "bad.mcap: this is not the log of an ejector")]
+    return report(sorted(results, key=lambda one: one.begin_ns), records, 0, refused)
+
+
+def test_a_german_page_counts_and_says_why_in_german(tmp_path: Path) -> None:
+    write_page(some_of_all(), tmp_path / "a.html", language_of("de", "language"))
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "43 Geräte: 5 fallen auf, 35 fallen nicht auf, 3 nicht beurteilbar" in page
+    assert "Leckage +0,03" in page
+    assert "sl/min/Tag über 190 Tage" in page
+    assert re.search(r"Saugleistungsverlust: Sprung um \+\S+ %, spätestens \d\d\.\d\d\.1970", page)
+    assert "keine Diagnose: nur 3 Zyklen sind auswertbar" in page
+    assert '<p lang="en">this is not the log of an ejector</p>' in page

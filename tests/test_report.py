@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rigs
+from written_pages import ENGLISH_WORDS, visible
 
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
@@ -458,9 +459,6 @@ RECORD = (
 SHAPE = {"where": "hold", "depends_on": ["vacuum"]} | {
     "shape": "up to +22.5 mbar of pressure, at 31 ms after it begins"
 }
-ENGLISH_WORDS = re.compile(
-    r"\b(the|and|of|with|is|are|from|that|not|which|cause|log|cycles?|by|to|mean|expected|left)\b"
-)
 
 
 @pytest.fixture(scope="module")
@@ -492,13 +490,6 @@ def german(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         write_report(one, folder / "a.html", language_of("de", "language"))
         pages[verdict] = (folder / "a.html").read_text(encoding="utf-8")
     return pages
-
-
-def visible(page: str) -> str:
-    """What a person reads or hears, without what was given: the log's name and the program's."""
-    texts = re.findall(r">([^<>]+)<", re.sub(r"<style.*?</style>", "", page, flags=re.DOTALL))
-    texts += re.findall(r'aria-label="([^"]*)"', page)
-    return re.sub(r"ejector-twin [\d.]+|\w+\.mcap", "", "\n".join(texts))
 
 
 @pytest.mark.parametrize("name", ["explained", "two", "some", "part", "unlisted", "consistent"])

@@ -18,6 +18,8 @@ from twin.alarms.causes import cause_of
 from twin.alarms.limits import ADJUSTABLE
 from twin.alarms.rules import by_cause, default_rules
 from twin.alarms.text import COMMISSION
+from twin.calibration.page import MARKS
+from twin.calibration.verdict import WEAKENS
 from twin.catalogues import read_catalog
 from twin.diagnosis import text as answer_text
 from twin.diagnosis.curves import DEVIATION
@@ -86,12 +88,13 @@ def _in_tables() -> Iterator[Text]:
     for status in (400, 401, 403, 404, 503):
         yield "twin/page/app.py", HTTPStatus(status).phrase
     yield "twin/instants.py", DATE
+    yield from (("twin/calibration/verdict.py", text) for text in (*MARKS, *WEAKENS.values()))
     yield from _of_answers()
 
 
 def _of_answers() -> Iterator[Text]:
     """Texts of a diagnosis that are no literals of its report."""
-    names = [*KINDS, *OVER.values(), "absolute time", "supply", *Course]
+    names = [*KINDS, *OVER.values(), "absolute time", "supply", *Course, *BANNER]
     definitions = [*EFFECTS.values(), *PLACES.values(), *WHENS.values()]
     names += [parameter.name for entry in definitions for parameter in entry.parameters]
     for name in names:

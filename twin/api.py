@@ -283,9 +283,14 @@ class Commissioned(Calibrated):
         """What the record contradicts in the configuration, and the line to write instead."""
         return [f"{remark.text}: {remark.line}" for remark in self._commissioning.remarks]
 
-    def report(self, path: Place) -> None:
-        """Write it with pictures as one HTML file; SourceError if it cannot be written."""
-        calibration_page.write_page(self._commissioning, self.config.asset, Path(path))
+    def report(self, path: Place, language: str = "en") -> None:
+        """Write it with pictures as one HTML file, in a language such as ``de``.
+
+        ConfigError if there are no texts in it, SourceError if the file cannot be written.
+        """
+        calibration_page.write_page(
+            self._commissioning, self.config.asset, Path(path), language_of(language, "language")
+        )
 
     def save(self) -> Record:
         """Store it in the asset database as the unit's data set, like ``twin commission``.

@@ -31,6 +31,7 @@ from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
+from twin.language import numeral, tr
 from twin.model.dataset import Ambient, DataSet, sensor_place
 from twin.model.gas import GAMMA, R
 from twin.model.system import Cups, Part, Sensor, Tube, volume
@@ -119,10 +120,10 @@ class Commissioned:
         """One sentence on what the record's cadence cannot show; empty if it shows all."""
         if self.readings.period <= COARSE:
             return ""
-        apart = f"{self.readings.period / MS:.0f} ms"
-        return (
-            f"with a row each {apart}, when valves and nozzle act and how the pressure begins to"
-            f" move is known to about {apart}; smaller delays are not told apart"
+        return tr(
+            "with a row each {apart} ms, when valves and nozzle act and how the pressure begins to"
+            " move is known to about {apart} ms; smaller delays are not told apart",
+            apart=numeral(self.readings.period / MS, ".0f"),
         )
 
 
@@ -276,7 +277,7 @@ def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]
         f"by the flow meter {_rough(metered / ML)} ml are evacuated; the configuration says"
         f" {_rough(configured / ML)}"
     )
-    line = f"[[data.system.parts]] {' and '.join(lines)}"
+    line = f"[[data.system.parts]] {'; '.join(lines)}"
     system = data.system.model_copy(update={"parts": scaled})
     return data.model_copy(update={"system": system}), [Remark(text, line)]
 
@@ -478,8 +479,11 @@ def another_ambient(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
     was, now = configured.ambient.pressure_mbar, fitted.data.ambient.pressure_mbar
     sigma = float(fitted.spread[keys.index(AMBIENT.name)])
     if abs(now - was) > max(AMBIENT_CLEARLY, SURELY * sigma):
-        text = f"the closed system follows an ambient pressure of {now:.0f} mbar; the configuration"
-        yield Remark(f"{text} says {was:g}", f"[data.ambient] pressure_mbar = {now:.0f}")
+        text = (
+            f"the closed system follows an ambient pressure of {now:.0f} mbar; the configuration"
+            f" says {was:g}"
+        )
+        yield Remark(text, f"[data.ambient] pressure_mbar = {now:.0f}")
 
 
 def misplaced(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
@@ -497,10 +501,14 @@ def misplaced(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
         )
         text = (
             f"the pressure is read nearer to {nearer}; the configuration has the sensor nearer to"
+            f" {farther}"
         )
-        order = "after" if fitted_place > configured_place else "before"
-        line = f'[[data.system.parts]] kind = "sensor", {order} the tubes'
-        yield Remark(f"{text} {farther}", line)
+        line = (
+            '[[data.system.parts]] kind = "sensor", after the tubes'
+            if fitted_place > configured_place
+            else '[[data.system.parts]] kind = "sensor", before the tubes'
+        )
+        yield Remark(text, line)
 
 
 def _thresholds(ejector: dict[str, Any], readings: Readings, ambient: float) -> list[Remark]:

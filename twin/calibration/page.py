@@ -7,15 +7,18 @@ from pathlib import Path
 from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
 from twin.calibration.picture import draw_fit
-from twin.calibration.report import calibration_headline, headline, parameters
+from twin.calibration.report import calibration_headline, headline, parameters, sentences
+from twin.calibration.verdict import Verdict
 from twin.config import Asset
 from twin.diagnosis import page
 from twin.diagnosis.drawing import as_svg
+from twin.diagnosis.retelling import retold
+from twin.diagnosis.text import capital, listed, spoken
 from twin.files import write_text
-from twin.language import ENGLISH
+from twin.language import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
 from twin.signals import MBAR, Samples
 
-MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#b36b00"), "refused": ("■", "#b3261e")}
+MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#8a5200"), "refused": ("■", "#b3261e")}
 
 
 def summary(commissioned: Commissioned, asset: Asset) -> str:
@@ -34,79 +37,103 @@ def calibration_summary(calibration: Calibration, asset: Asset, samples: Samples
     return page.summary(title, [_parameters(calibration)], picture)
 
 
-def write_page(commissioned: Commissioned, asset: Asset, path: Path) -> None:
-    """Write the page, one HTML file that needs no network."""
+def write_page(
+    commissioned: Commissioned, asset: Asset, path: Path, language: Language = ENGLISH
+) -> None:
+    """Write the page, one HTML file; SourceError if it cannot be written."""
+    with speaking(language):
+        write_text(path, _page(commissioned, asset))
+
+
+def _page(commissioned: Commissioned, asset: Asset) -> str:
     mark, colour = MARKS[commissioned.verdict.word]
+    cycles = commissioned.calibration.cycles
+    why = [page.paragraph(f"{capital(text)}.") for text in sentences(commissioned.verdict)]
     parts = [
-        page.section("What to change", "\n".join(_remarks(commissioned))),
+        page.section(tr("Why"), "\n".join(why)),
+        page.section(tr("What to change"), "\n".join(_remarks(commissioned))),
         _picture(commissioned),
-        page.section("How close", _residuals(commissioned)),
-        page.section("What was found", _parameters(commissioned.calibration)),
+        page.section(tr("How close"), _residuals(commissioned)),
+        page.section(tr("What was found"), _parameters(commissioned.calibration)),
     ]
-    text = page.PAGE.substitute(
-        language=ENGLISH.code,
-        title=html.escape(f"Commissioning of {asset.id}"),
+    return page.PAGE.substitute(
+        language=language_code(),
+        title=html.escape(tr("Commissioning of {unit}", unit=asset.id)),
         colour=colour,
         mark=mark,
-        verdict=commissioned.verdict.word,
-        headline=html.escape(f"{asset.type} {asset.id}: {headline(commissioned.verdict)}"),
+        verdict=html.escape(f"{capital(tr(commissioned.verdict.word))} – {asset.type} {asset.id}"),
+        headline=html.escape(f"{_result(commissioned.verdict)}."),
         body="\n".join(parts),
-        footer=f"{commissioned.calibration.cycles} cycles; pressures in mbar, intervals of 95 %",
+        footer=ntr(
+            "{count} cycle; pressures in mbar, intervals of 95 %",
+            "{count} cycles; pressures in mbar, intervals of 95 %",
+            cycles,
+        ),
     )
-    write_text(path, text)
 
 
 def _remarks(commissioned: Commissioned) -> Iterator[str]:
     for remark in commissioned.remarks:
-        yield page.box(remark.text, f"The record's value is used. Write: {remark.line}")
+        advice = tr("The record's value is used. Write: {line}", line=retold(remark.line))
+        yield page.box(capital(retold(remark.text)), advice)
     for contradiction in commissioned.contradictions:
-        yield page.box(
-            contradiction.what, f"{contradiction.action[0].upper()}{contradiction.action[1:]}."
-        )
+        action = capital(retold(contradiction.action))
+        yield page.box(capital(retold(contradiction.what)), f"{action}.")
     if not commissioned.remarks and not commissioned.contradictions:
-        yield page.paragraph("Nothing to change: the record does not contradict the configuration.")
+        yield page.paragraph(
+            tr("Nothing to change: the record does not contradict the configuration.")
+        )
     if commissioned.unseen:
-        yield page.paragraph(commissioned.unseen)
+        yield page.paragraph(f"{capital(commissioned.unseen)}.")
 
 
 def _residuals(commissioned: Commissioned) -> str:
-    head = ("phase", "rms left, mbar", "floor, mbar", "times the floor")
+    head = (tr("phase"), tr("rms left, mbar"), tr("floor, mbar"), tr("times the floor"))
     rows = (
         (
-            phase.name.lower().replace("_", "-"),
+            spoken(phase.name.lower()),
             *(
-                f"{value:.2f}"
+                numeral(value, ".2f")
                 for value in (residual.left / MBAR, residual.floor / MBAR, residual.times)
             ),
         )
         for phase, residual in commissioned.verdict.residuals.items()
     )
-    caption = "The floor is what cycles of this record differ by, noise included"
+    caption = tr("The floor is what cycles of this record differ by, noise included")
     return page.table(caption, head, rows, numbers=(1, 2, 3))
 
 
 def _parameters(calibration: Calibration) -> str:
-    head = ("value", "found", "from", "to", "unit", "known from")
+    head = (tr("key"), tr("value"), tr("from"), tr("to"), tr("unit"), tr("known from"))
+    sources = {True: tr("record"), False: tr("assumed")}
     rows = (
         (
             name,
-            *(f"{parameter[key]:.4g}" for key in ("value", "low95", "high95")),
+            *(numeral(parameter[key], ".4g") for key in ("value", "low95", "high95")),
             parameter["unit"],
-            "record" if parameter["determined"] else "assumed",
+            sources[parameter["determined"]],
         )
         for name, parameter in parameters(calibration).items()
     )
-    return page.table("Values of the data set, with intervals of 95 %", head, rows, (1, 2, 3))
+    caption = tr("Values of the data set, with intervals of 95 %")
+    return page.table(caption, head, rows, (1, 2, 3))
 
 
 def _picture(commissioned: Commissioned) -> str:
-    title = f"Measured against fitted: {_worst(commissioned)}"
+    title = tr("Measured against fitted: {result}", result=_result(commissioned.verdict))
     picture = draw_fit(commissioned.calibration.fitted.data, commissioned.samples)
-    return page.picture(title, as_svg(picture), "The cycle whose deviation is the median of all.")
+    caption = tr("The cycle whose deviation is the median of all.")
+    return page.picture(title, as_svg(picture), caption)
 
 
-def _worst(commissioned: Commissioned) -> str:
-    if not commissioned.verdict.weak:
-        return "the twin follows every phase"
-    names = [phase.name.lower().replace("_", "-") for phase in commissioned.verdict.weak]
-    return f"the twin is off in {' and '.join(names)}"
+def _result(verdict: Verdict) -> str:
+    """Which phases the twin follows, in a short sentence without a full stop."""
+    if not verdict.weak:
+        return tr("The twin follows every phase")
+    phases = [spoken(phase.name.lower()) for phase in verdict.weak]
+    return ntr(
+        "The twin is off in {phases}",
+        "The twin is off in {phases}",
+        len(phases),
+        phases=listed(phases),
+    )

@@ -4,13 +4,12 @@ import numpy as np
 
 from twin.diagnosis.curves import Expected, draw_curves
 from twin.diagnosis.drawing import Picture, empty
+from twin.language import tr
 from twin.live import Twin
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.cycles import Cycle, whole
 from twin.signals import MBAR, MS, NS, Samples
-
-ALT = "Vacuum of one cycle, measured and fitted, and the deviation below it"
 
 
 def draw_fit(data: DataSet, samples: Samples) -> Picture:
@@ -22,10 +21,11 @@ def draw_fit(data: DataSet, samples: Samples) -> Picture:
         (ambient - pressure.astype(np.float64)) / MBAR
         for pressure in (cycle.samples["pressure"], cycle.ticks["expected"])
     )
-    with empty("fit", 5.0, ALT) as picture:
-        expected = [Expected(fitted, "fitted")]
+    alt = tr("Vacuum of one cycle, measured and fitted, and the deviation below it")
+    with empty("fit", 5.0, alt) as picture:
+        expected = [Expected(fitted, tr("fitted"))]
         below = draw_curves(picture, ms, measured, expected, cycle.ticks["phase"])
-        below.set_xlabel("time since the suction edge (ms)")
+        below.set_xlabel(tr("time since the suction edge (ms)"))
     return picture
 
 

@@ -7,6 +7,8 @@ from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
+from twin.diagnosis.text import spoken
+from twin.language import numeral, tr
 from twin.signals import MBAR, MS, Phase
 
 
@@ -101,28 +103,49 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
 
 
 def headline(verdict: Verdict) -> str:
-    """The verdict in a sentence or two."""
+    """The verdict in a word, and what it rests on."""
+    return f"{tr(verdict.word)}: {'. '.join(sentences(verdict))}"
+
+
+def sentences(verdict: Verdict) -> list[str]:
+    """What the verdict rests on, and what follows from it; none ends in a full stop."""
     if verdict.word == "good":
-        return "good: the twin follows this record as closely as its cycles follow each other"
+        return [tr("the twin follows this record as closely as its cycles follow each other")]
     weak = "; ".join(_weak(phase, verdict.residuals[phase]) for phase in verdict.weak)
-    beyond = f"the twin is off by more than its cycles differ: {weak}"
+    beyond = tr("the twin is off by more than its cycles differ: {weak}", weak=weak)
     if verdict.word == "usable":
-        return f"usable: {beyond}. Causes that act there are named less surely"
-    return (
-        f"refused: {beyond}. Nothing is stored: causes would be named wrongly. Commands, unit and"
-        " sign look right, and the fit makes up for rough volumes and tubes. So something hangs on"
-        " the ejector that [data.system.parts] does not list, or the unit has a fault already, or"
-        " it does what the model has not. What needs no twin: twin figures, twin compare"
-    )
+        return [beyond, tr("Causes that act there are named less surely")]
+    return [
+        beyond,
+        tr("Nothing is stored: causes would be named wrongly"),
+        tr(
+            "Commands, unit and sign look right, and the fit makes up for rough volumes and tubes."
+            " So something hangs on the ejector that [data.system.parts] does not list, or the unit"
+            " has a fault already, or it does what the model has not"
+        ),
+        tr("What needs no twin: twin figures, twin compare"),
+    ]
 
 
 def _weak(phase: Phase, off: Residual) -> str:
     """The residual of a phase, its largest value, and the causes that it concerns."""
-    side = "above" if off.most > 0.0 else "below"
-    return (
-        f"{off.times:.1f} times in {phase.name.lower().replace('_', '-')}, at most"
-        f" {abs(off.most) / MBAR:.1f} mbar measured {side} expected, {off.at / MS:.0f} ms after it"
-        f" begins ({WEAKENS[phase]})"
+    values = {
+        "times": numeral(off.times, ".1f"),
+        "phase": spoken(phase.name.lower()),
+        "size": numeral(abs(off.most) / MBAR, ".1f"),
+        "time": numeral(off.at / MS, ".0f"),
+        "causes": tr(WEAKENS[phase]),
+    }
+    if off.most > 0.0:
+        return tr(
+            "{times} times in {phase}, at most {size} mbar measured above expected, {time} ms after"
+            " it begins ({causes})",
+            **values,
+        )
+    return tr(
+        "{times} times in {phase}, at most {size} mbar measured below expected, {time} ms after it"
+        " begins ({causes})",
+        **values,
     )
 
 

@@ -15,6 +15,7 @@ from twin.cli.options import (
     ConfigOption,
     JsonAlone,
     JsonFile,
+    LanguageCode,
     LogFile,
     PageFile,
     UnitId,
@@ -24,6 +25,8 @@ from twin.cli.options import output as output_option
 from twin.cli.stopping import closed
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
+from twin.language import ENGLISH
+from twin.languages import language_of
 
 if TYPE_CHECKING:
     from twin.settings import Document
@@ -67,6 +70,7 @@ def commission(
     source: Annotated[
         Path, typer.Argument(metavar="LOG.mcap|CONFIG", help="A record, or the unit's PLC.")
     ],
+    *,
     unit: UnitId = "",
     config: ConfigOption = None,
     cycles: Annotated[
@@ -76,6 +80,7 @@ def commission(
     output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
     report: PageFile = None,
+    language: LanguageCode = ENGLISH.code,
 ) -> None:
     """Fit a unit that nobody has seen before to a record of healthy cycles, and store it.
 
@@ -92,6 +97,7 @@ def commission(
     json_file = chosen(output, "--json", json_file, JSON)
     report = chosen(output, "--report", report, PAGE)
     require_writable(json_file, report)
+    report_language = language_of(language, "--language")
     recorded = None if source.suffix == ".toml" else open_log(source)
     if recorded is not None:
         recorded.header.require_commands(str(source))
@@ -123,7 +129,7 @@ def commission(
     if report is not None:
         from twin.calibration.page import write_page  # with Matplotlib
 
-        write_page(commissioned, settings.asset, report)
+        write_page(commissioned, settings.asset, report, report_language)
     if record is None:
         raise typer.Exit(2)
 

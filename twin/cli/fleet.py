@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from twin.cli.app import App, read_config, say_if_cut, say_if_new
-from twin.cli.options import JSON, PAGE, JsonAlone, JsonFile, written_as
+from twin.cli.options import JSON, PAGE, JsonAlone, JsonFile, LanguageCode, written_as
 from twin.cli.options import chosen as chosen_file
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError
 from twin.extras import require
 from twin.files import require_writable, write_json
+from twin.language import ENGLISH
+from twin.languages import language_of
 
 if TYPE_CHECKING:
     from sqlalchemy import URL
@@ -109,6 +111,7 @@ def report(
     output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
     page: Page = None,
+    language: LanguageCode = ENGLISH.code,
 ) -> None:
     """Say which units stand out or drift, and in what, worst first; new logs are replayed."""
     from twin.assets.database import open_assets
@@ -119,6 +122,7 @@ def report(
     json_file = chosen_file(output, "--json", json_file, JSON)
     page = chosen_file(output, "--html", page, PAGE)
     require_writable(json_file, page)
+    page_language = language_of(language, "--language")
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
     from twin.fleet.text import in_words, write_page  # with Matplotlib, which the engine requires
 
@@ -137,7 +141,7 @@ def report(
     if json_file is not None:
         write_json(json_file, fleet_report.plain())
     if page is not None:
-        write_page(fleet_report, page)
+        write_page(fleet_report, page, page_language)
         print(f"drawn in {page}")
     _leave(outcomes)
 

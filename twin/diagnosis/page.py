@@ -6,6 +6,7 @@ All text is escaped; pictures are SVG.
 import base64
 import html
 import io
+import re
 from collections.abc import Iterable, Sequence
 from string import Template
 
@@ -41,7 +42,7 @@ footer { border-top: 1px solid #ccc; margin-top: 2rem; }
 table { border-collapse: collapse; margin: .3rem 0 1.4rem; min-width: 50%; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px solid #ddd;
-  vertical-align: top; }
+  vertical-align: top; hyphens: auto; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.6rem; }
 dt { color: #444; }
 dd { margin: 0; overflow-wrap: anywhere; }
@@ -50,14 +51,16 @@ tbody th { font-weight: 400; white-space: nowrap; }
 td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
 .number { text-align: right; font-variant-numeric: tabular-nums; max-width: 14rem; }
-thead .number { white-space: nowrap; }
+@media (max-width: 56rem) {
+  th, td { padding-right: .9rem; }
+  td, td:nth-child(2) { min-width: 0; }
+}
 @media (max-width: 40rem) {
   body { margin: .6rem auto; padding: 0 .6rem; }
   dl, article dl { grid-template-columns: fit-content(9rem) 1fr; gap: .2rem .8rem; }
   tbody th { white-space: normal; }
+  table { font-size: .88rem; }
   th, td { padding-right: .7rem; }
-  td, td:nth-child(2) { min-width: 0; }
-  thead .number { white-space: normal; }
 }
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }
@@ -133,13 +136,19 @@ def section(title: str, body: str) -> str:
 def picture(title: str, svg: str, caption: str) -> str:
     """A picture under a heading that states the conclusion."""
     caption = f"<figcaption>{html.escape(caption)}</figcaption>"
-    return section(title, f"<figure>{svg}{caption}</figure>")
+    return section(title, f'<figure tabindex="0">{svg}{caption}</figure>')
 
 
 def card(title: str, sentence: str, rows: Iterable[tuple[str, str]]) -> str:
     """One finding, with its details."""
     top = f"<h3>{html.escape(title)}</h3>\n<p>{html.escape(sentence)}</p>"
     return f"<article>{top}\n{pairs(rows)}</article>"
+
+
+def english_card(title: str, sentence: str) -> str:
+    """One finding in a sentence that stays English on a page of any language."""
+    top = f'<h3>{html.escape(title)}</h3>\n<p lang="en">{html.escape(sentence)}</p>'
+    return f"<article>{top}</article>"
 
 
 def box(title: str, text: str) -> str:
@@ -172,13 +181,15 @@ def table(
         for h, s in zip(head, style, strict=True)
     )
     body = "".join(f"<tr>{_row(row, style)}</tr>\n" for row in rows)
+    top_line = f"<caption>{html.escape(caption)}</caption>\n" if caption else ""
     return (
-        f'<div class="wide"><table><caption>{html.escape(caption)}</caption>\n'
+        f'<div class="wide" tabindex="0"><table>{top_line}'
         f"<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
     )
 
 
 def _row(cells: Sequence[str], style: Sequence[str]) -> str:
     first, *rest = map(html.escape, cells)
+    first = re.sub(r"(?<=\w[._])(?=\w)", "<wbr>", first)  # where a long key may be broken
     data_cells = "".join(f"<td{s}>{cell}</td>" for cell, s in zip(rest, style[1:], strict=True))
     return f'<th scope="row">{first}</th>{data_cells}'

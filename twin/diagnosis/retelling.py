@@ -80,6 +80,32 @@ _ALARMS = (  # evidence of alarms
     "set in [figures]",
     "from the unit's data set",
 )
+_COMMISSIONING = (  # what a record corrects in the configuration, and the lines to write instead
+    "the opened system stands at {measured} mbar; the configuration says {configured}",
+    "the closed system follows an ambient pressure of {fitted} mbar; the configuration says"
+    " {configured}",
+    "in no suction the nozzle goes off by itself; the configuration has air saving on",
+    "no row of the record has blow-off; where the unit has one, its command is missing",
+    "the vacuum is {highest} mbar at most, where ejectors make 300 and more",
+    "by the flow meter {metered} ml are evacuated; the configuration says {configured}",
+    "the pressure is read nearer to {place}; the configuration has the sensor nearer to"
+    " {configured}",
+    "the vessel",
+    "the port",
+    "the nozzle goes off at {measured} mbar; the configuration says {configured}",
+    "the nozzle goes on again {measured} mbar below that; the configuration says {configured}",
+    "part present comes at {measured} mbar; the configuration says {configured}",
+    "[driver.tags.blow_off], or the column blow_off",
+    "[driver.tags.pressure] unit, if it is in kPa, mmHg or psi",
+    '[[data.system.parts]] kind = "sensor", after the tubes',
+    '[[data.system.parts]] kind = "sensor", before the tubes',
+)
+_FLEETS = (  # why a unit of a fleet could not be judged
+    "no cycle of its newest log can be compared",
+    "{count} unit to compare, {needed} are needed; its newest log is not diagnosed yet",
+    "{count} units to compare, {needed} are needed; its newest log is not diagnosed yet",
+    "no diagnosis: {reason}",
+)
 _AS_WRITTEN = {"tag", "command"}  # values that a person types
 _SIZE = re.compile(r"([a-z][a-z0-9 ]*?) ([-+]?\d\S* \S+)")  # a name with its size
 
@@ -101,6 +127,8 @@ def templates() -> list[str]:
         *_UNLISTED,
         *_SIGNALS,
         *_ALARMS,
+        *_COMMISSIONING,
+        *_FLEETS,
         *caution_words,
         *(text for when in WHENS.values() for text in (when.sentence, when.formula)),
         *map(capitalised, PLACES.values()),

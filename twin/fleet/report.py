@@ -181,9 +181,12 @@ def _judged(standing: Standing | None, newest: Result | None, last: Result) -> t
         return judgement
     if standing is None or not current:
         return State.NOT_JUDGED, "no cycle of its newest log can be compared"
-    units = "1 unit" if standing.peers == 1 else f"{standing.peers} units"
-    needed = f"{units} to compare, {FEWEST_PEERS} are needed"
-    return State.NOT_JUDGED, f"{needed}; its newest log is not diagnosed yet"
+    unit = "unit" if standing.peers == 1 else "units"
+    return (
+        State.NOT_JUDGED,
+        f"{standing.peers} {unit} to compare, {FEWEST_PEERS} are needed; its newest log is not"
+        " diagnosed yet",
+    )
 
 
 def _diagnosed(newest: Result, last: Result) -> tuple[State, str] | None:
