@@ -400,6 +400,51 @@ def test_what_cannot_be_imported_is_said_and_leaves_nothing(
     assert [path.name for path in here.iterdir()] == ["a.csv"]
 
 
+def test_a_database_that_is_not_made_yet_hinders_no_import_and_no_run_but_a_search(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = here / "cell.toml"
+    cell.write_text(f'{GRIPPER.read_text()}\n[assets]\nurl = "sqlite:///plant.sqlite"\n')
+    assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
+    command = ("import", "a.csv", "--config", cell, "-o", "in.mcap")
+    assert twin(monkeypatch, *command) == 0
+    said = capsys.readouterr().err
+    assert "plant.sqlite: no such asset database yet; the shipped data sets are used" in said
+    assert same(log, here / "in.mcap")
+    assert twin(monkeypatch, "replay", "in.mcap", "--config", cell) == 0
+    assert "no such asset database yet" in capsys.readouterr().err
+    assert not (here / "plant.sqlite").exists()
+    for search in (("--id", "another"), ("--assets", "plant.sqlite")):
+        assert twin(monkeypatch, *command, "--force", *search) == 3
+        said = capsys.readouterr().err
+        assert "plant.sqlite: no such asset database" in said
+        assert "twin commission or calibrate, or twin assets add or import, makes one" in said
+
+
+def test_an_imported_log_takes_the_place_of_no_log_in_parts(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
+    for part in ("in.mcap", "in.0001.mcap"):
+        (here / part).write_bytes(b"mine")
+    command = ("import", "a.csv", "--config", GRIPPER, "-o", "in.mcap", "--force")
+    assert twin(monkeypatch, *command) == 3
+    assert "a log in several parts" in capsys.readouterr().err
+    assert (here / "in.mcap").read_bytes() == b"mine"
+
+
+def test_an_export_replaces_a_table_if_told_to(
+    log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (("export", log), ("figures", "show", log), ("figures", "costs", log)):
+        (here / "a.csv").write_bytes(b"mine")
+        assert twin(monkeypatch, *command, "-o", "a.csv") == 3
+        assert "a.csv: there is already a file of that name" in capsys.readouterr().err
+        assert (here / "a.csv").read_bytes() == b"mine"
+        assert twin(monkeypatch, *command, "-o", "a.csv", "--force") == 0
+        assert (here / "a.csv").stat().st_size > 100
+
+
 def test_an_import_replaces_no_log_but_what_a_killed_one_left(
     log: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -407,8 +452,13 @@ def test_an_import_replaces_no_log_but_what_a_killed_one_left(
     assert twin(monkeypatch, "export", log, "-o", "a.csv") == 0
     (here / "in.mcap").write_bytes(b"mine")
     assert twin(monkeypatch, *command) == 3
-    assert "already a file of that name" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "already a file of that name" in said
+    assert "replace it with --force" in said
     assert (here / "in.mcap").read_bytes() == b"mine"
+    assert twin(monkeypatch, *command, "--force") == 0
+    assert same(log, here / "in.mcap")
+    (here / "in.mcap").write_bytes(b"mine")
     (here / "in.mcap").rename(here / "in.mcap.part")
     assert twin(monkeypatch, *command) == 0
     assert same(log, here / "in.mcap")

@@ -187,6 +187,7 @@ def test_kept_cycles_are_exported(figures: Run) -> None:
     )
     with pytest.raises(SourceError, match="there is already a file of that name"):
         figures("export", "-o", "f.parquet")
+    assert figures("export", "-o", "f.parquet", "--force") == "100 cycles in f.parquet\n"
 
 
 def test_of_several_units_one_is_named(figures: Run, tmp_path: Path) -> None:

@@ -173,6 +173,8 @@ def test_a_file_that_is_there_is_not_overwritten(
     assert twin(monkeypatch, "init") == 3
     assert "already a file" in capsys.readouterr().err
     assert Path("cell.toml").read_text() == "mine"
+    assert twin(monkeypatch, "init", "--force") == 0
+    assert "[asset]" in Path("cell.toml").read_text()
 
 
 def test_what_is_wrong_is_said_and_nothing_is_written(

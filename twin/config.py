@@ -120,21 +120,26 @@ class Config:
         ``assets`` and ``unit`` replace the configured database and ID. ConfigError if the database
         does not know ``unit`` and it is not ``own``, the unit of a log. Without ``calibrated`` the
         unit gets its type's data set even if it has its own; it may be new. ``as_of_ns`` (UTC)
-        ignores what was stored later. ``to_store`` allows a missing database.
+        ignores what was stored later. ``to_store`` allows a missing database, and so does one that
+        only the configuration names.
         """
-        from twin.assets.database_url import open_chosen
+        from twin.assets.database_url import name_of, open_chosen
 
         document.refuse_unknown_tables(TABLES)
         _refuse_calibrated(document)
         asset = _asset(document, unit)
-        to_store = to_store or not calibrated  # otherwise it will be calibrated and stored
+        configured_unit = document.section(Asset, "asset").id
+        is_search = calibrated and unit not in ("", own, configured_unit)
+        # A database that the configuration names is made when the unit is commissioned.
+        is_needed = bool(assets) or as_of_ns is not None or is_search
+        to_store = to_store or not calibrated or not is_needed
         with open_chosen(assets, document, write=False, to_store=to_store) as database:
-            if unit and calibrated and unit not in (own, document.section(Asset, "asset").id):
-                _require_unit(database, unit, {own, document.section(Asset, "asset").id} - {""})
+            if is_search:
+                _require_unit(database, unit, {own, configured_unit} - {""})
             record = _find_record(
                 database, document, asset.type, asset.id if calibrated else "", as_of_ns
             )
-            database_name = database.name
+            database_name = name_of(assets, document)
         layers = _layers(document, record, database_name)
         config = cls._checked(document, asset, layers, _origin(record, layers))
         if calibrated and not (record and record.used == "instance"):

@@ -50,6 +50,15 @@ def require_writable(*paths: Path | None) -> None:
             raise _unwritable(path, "no folder to write to")
 
 
+def refuse_existing(path: Path, *, force: bool = False) -> None:
+    """SourceError if a file with data or settings would be replaced without ``--force``."""
+    if path.exists() and not force:
+        raise SourceError(
+            f"{path}: there is already a file of that name",
+            "choose another name, or replace it with --force",
+        )
+
+
 def require_ending(path: Path, *endings: str) -> str:
     """The ending of a new file's name, in small letters: it decides the format.
 

@@ -55,7 +55,7 @@ def open_assets(
     if the database cannot be reached, read or written, or stays locked.
     """
     makers = "twin commission or calibrate, or twin assets add or import, makes one"
-    absent_hint = "" if create else f"check --assets; {makers}"
+    absent_hint = "" if create else f"check --assets, or [assets] url; {makers}"
     assets = Assets(where, ASSETS, busy_s, clock, absent_hint)
     with assets.closed_on_error():
         assets.prepare(shipped=shipped)

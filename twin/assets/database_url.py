@@ -6,7 +6,7 @@ from sqlalchemy import URL
 
 from twin.assets.configured import DatabaseSettings
 from twin.assets.database import Assets, open_assets
-from twin.assets.engine import ASSETS, configured, parse_url, sqlite_file
+from twin.assets.engine import ASSETS, configured, parse_url, shown, sqlite_file
 from twin.settings import Document
 
 FILE = "assets.sqlite"
@@ -43,6 +43,11 @@ def is_new(named: str | URL, document: Document | None) -> bool:
     """Whether that database is a file that does not exist yet."""
     file = sqlite_file(chosen(named, document))
     return file is not None and not file.exists()
+
+
+def name_of(named: str | URL, document: Document | None) -> str:
+    """The file or URL of that database, for messages; without a password."""
+    return shown(chosen(named, document))
 
 
 def chosen(named: str | URL, document: Document | None) -> URL:

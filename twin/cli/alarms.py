@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from twin.cli.app import App, audit_of, chosen_unit, not_negative, read_config, user_here
-from twin.cli.options import TABLES, JsonAlone
+from twin.cli.options import TABLES, Force, JsonAlone
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError
-from twin.files import write_json
+from twin.files import refuse_existing, write_json
 from twin.instants import instant
 
 if TYPE_CHECKING:
@@ -190,11 +190,13 @@ def export(
     standing: Annotated[
         bool, typer.Option("--standing", help="What stands now, instead of the history.")
     ] = False,
+    force: Force = False,
 ) -> None:
     """Write the history of a unit's alarms, or what stands, as a table for other programs."""
     from twin.alarms.export import history_table, standing_table
     from twin.tables.sheet import export as export_table
 
+    refuse_existing(output, force=force)
     since = None if days is None else time.time_ns() - round(days * 86_400e9)
     with _open(alarms, config) as store:
         chosen = chosen_unit(store, config, unit)
@@ -204,7 +206,7 @@ def export(
         else:
             rules = {name: alarm.rule for name, alarm in _board(config).alarms.items()}
             table = history_table(store.episodes(chosen, since), rules, chosen)
-    export_table(table, output)
+    export_table(table, output, force=force)
     print(f"{table.num_rows} alarms in {output}")
 
 

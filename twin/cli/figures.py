@@ -10,12 +10,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import App, chosen_unit, not_negative, read_config, say_if_cut
-from twin.cli.options import JSON, PICTURES, TABLES, JsonAlone, JsonFile, LogFile, PictureFile
+from twin.cli.options import (
+    JSON,
+    PICTURES,
+    TABLES,
+    Force,
+    JsonAlone,
+    JsonFile,
+    LogFile,
+    PictureFile,
+)
 from twin.cli.options import UnitId as LogUnit
 from twin.cli.options import chosen as chosen_file
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError
-from twin.files import require_writable, write_json
+from twin.files import refuse_existing, require_writable, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,6 +64,7 @@ def show(
     output: Annotated[Path | None, output_option(*TABLES, JSON)] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Add them to the database.")] = False,
     figures: Url = "",
+    force: Force = False,
 ) -> None:
     """Key figures of every cycle of a log: measured, expected, and read off the curve."""
     from twin.assets.unit import Unit
@@ -69,6 +79,8 @@ def show(
     json_file = chosen_file(output, "--json", json_file, JSON)
     table = chosen_file(output, "", None, *TABLES)
     require_writable(json_file, table)
+    if table is not None:
+        refuse_existing(table, force=force)
     recorded = open_log(log)
     say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
@@ -91,7 +103,7 @@ def show(
 
         with open_store("sqlite://") as store:
             store.add(unit, data_set, log.name, plain)
-            export_table(to_table(store.history(unit), unit), table)
+            export_table(to_table(store.history(unit), unit), table, force=force)
     if keep:
         with _open(figures, config, write=True) as store:
             count = store.add(unit, data_set, log.name, plain)
@@ -105,6 +117,7 @@ def costs(
     unit: LogUnit = "",
     json_file: JsonFile = None,
     output: Annotated[Path | None, output_option(*TABLES, JSON)] = None,
+    force: Force = False,
 ) -> None:
     """Air, energy and money of each day of a log, and of a year at its rate."""
     from twin.figures.costs import days, year
@@ -113,6 +126,8 @@ def costs(
     json_file = chosen_file(output, "--json", json_file, JSON)
     table = chosen_file(output, "", None, *TABLES)
     require_writable(json_file, table)
+    if table is not None:
+        refuse_existing(table, force=force)
     recorded, settings = _opened(log, config, unit)
     tariff, cycles = _tariff(settings), _cycles(recorded, settings)
     if recorded.header.derived:
@@ -125,7 +140,7 @@ def costs(
         from twin.figures.export import days_columns
         from twin.tables.sheet import export as export_table
 
-        export_table(days_columns(by_day, tariff), table)
+        export_table(days_columns(by_day, tariff), table, force=force)
 
 
 @figures_app.command()
@@ -254,15 +269,17 @@ def export(
     unit: UnitId = "",
     figures: Url = "",
     days: Days = None,
+    force: Force = False,
 ) -> None:
     """Write the kept cycles of a unit as a table for other programs."""
     from twin.figures.export import to_table
     from twin.tables.sheet import export as export_table
 
+    refuse_existing(output, force=force)
     with _open(figures, config, write=False) as store:
         chosen = chosen_unit(store, config, unit)
         table = to_table(_history(store, chosen, days), chosen)
-    export_table(table, output)
+    export_table(table, output, force=force)
     print(f"{table.num_rows} cycles in {output}")
 
 

@@ -13,8 +13,9 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from twin.errors import ConfigError, SourceError, known_names
-from twin.files import said_plainly
+from twin.cli.options import Force
+from twin.errors import ConfigError, known_names
+from twin.files import refuse_existing, said_plainly
 
 _STARTERS = Path(__file__).parents[1] / "starters"
 STARTERS = tuple(sorted(path.stem for path in _STARTERS.glob("*.toml")))
@@ -301,23 +302,23 @@ def init(
         Answer | None, typer.Option(help="Whether blow-off lets the part go.")
     ] = None,
     supply: Annotated[str | None, _size("--supply-bar", "At the regulator, gauge.")] = None,
+    force: Force = False,
 ) -> None:
     """Write a commented configuration to begin with, from flags or a few questions.
 
     On a terminal what no flag says is asked; unknown is an answer to most. Elsewhere it is
-    guessed, and the file says so. A file that is there is not overwritten. An example has its
-    simulated PLC with it, so it can be tried without a machine.
+    guessed, and the file says so. An example has its simulated PLC with it, so it can be tried
+    without a machine.
     """
-    if file.exists():
-        message = f"{file}: there is already a file of that name"
-        raise SourceError(message, "choose another name, or remove it")
+    refuse_existing(file, force=force)
     if starter:
-        _refuse_other_options(context, "file", "starter")
+        _refuse_other_options(context, "file", "force", "starter")
         _write(
             file,
             _example(starter),
             f"twin plc {file}",
             f"twin run {file} --log today.mcap   # in a second terminal",
+            force=force,
         )
         return
     questions = Questions()
@@ -352,12 +353,12 @@ def init(
         file, (named, typed), connection, pressure_meaning, system, questions.guessed
     )
     _check(text, file)
-    _write(file, text, *next_commands(file, connection))
+    _write(file, text, *next_commands(file, connection), force=force)
 
 
-def _write(file: Path, text: str, *commands: str) -> None:
+def _write(file: Path, text: str, *commands: str, force: bool) -> None:
     """Write a new file, and print the commands to run next."""
-    with said_plainly(file), file.open("x", encoding="utf-8") as stream:
+    with said_plainly(file), file.open("w" if force else "x", encoding="utf-8") as stream:
         stream.write(text)
     print(f"written: {file}; look through it, then:")
     for line in commands:

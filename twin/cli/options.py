@@ -40,6 +40,7 @@ LanguageCode = Annotated[
     str, typer.Option("--language", metavar="CODE", help="Language of the report, such as de.")
 ]
 ViewFlag = Annotated[bool, typer.Option("--view", help="Open the Rerun viewer.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace a file of that name.")]
 FailOnAlarm = Annotated[bool, typer.Option(help="Exit with 1 if an alarm was raised.")]
 
 

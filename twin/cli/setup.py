@@ -20,6 +20,7 @@ def configured(document: "Document", assets: str, unit: str) -> "Config":
     from twin.config import Config
 
     settings = Config.of(document, assets, unit)
+    _say_if_not_made(document, assets)
     _say_instead(settings, unit)
     return settings
 
@@ -47,8 +48,22 @@ def settings_of(
     settings = Config.of_recorded(
         header, str(log), document, assets, unit, as_of_ns, to_store=to_store
     )
+    if document is not None and not to_store:
+        _say_if_not_made(document, assets)
     _say_instead(settings, unit)
     return settings
+
+
+def _say_if_not_made(document: "Document", assets: str) -> None:
+    """Print a remark if [assets] names a database that does not exist yet."""
+    from twin.assets.database_url import AssetsSettings, is_new, name_of
+
+    if not assets and document.section(AssetsSettings, "assets").url and is_new("", document):
+        print(
+            f"twin: {name_of('', document)}: no such asset database yet; the shipped data sets are"
+            " used until twin commission makes it",
+            file=sys.stderr,
+        )
 
 
 def _say_instead(settings: "Config", unit: str) -> None:

@@ -11,13 +11,14 @@ import typer
 
 from twin.cli.app import say_if_cut
 from twin.cli.console import Console, progress, rows_progress
-from twin.cli.options import AssetsUrl, LogFile, UnitId
+from twin.cli.options import AssetsUrl, Force, LogFile, UnitId
 from twin.cli.options import output as output_option
 from twin.cli.setup import configured, pair_of
 from twin.cli.sinks import open_sinks
 from twin.cli.stopping import leave, stop_on_signal, until
 from twin.errors import SourceError
 from twin.extras import require
+from twin.files import refuse_existing
 
 if TYPE_CHECKING:
     from twin.tables.reader import Table
@@ -39,6 +40,7 @@ def import_(
     output: Annotated[
         Path | None, typer.Option("-o", metavar="LOG.mcap", help="Write the new log.")
     ] = None,
+    *,
     unit: UnitId = "",
     assets: AssetsUrl = "",
     time_zone: Annotated[
@@ -57,6 +59,7 @@ def import_(
         bool,
         typer.Option("--dry-run", help="Write nothing; show how FILE is understood."),
     ] = False,
+    force: Force = False,
 ) -> None:
     """Make a log of a PLC's trace export, with what the twin expects beside it."""
     require("tables", "twin import")
@@ -71,6 +74,8 @@ def import_(
 
     if output is not None:
         refuse_other_suffix(output)
+        if not dry_run:
+            _refuse_existing_log(output, force=force)
     elif not dry_run:
         raise typer.BadParameter("say with -o LOG.mcap where the log goes, or look with --dry-run")
     settings = configured(Document.read(config), assets, unit)
@@ -117,18 +122,27 @@ def _show(table: "Table", *, derive: bool) -> None:
         print(table.with_commands().commands)
 
 
+def _refuse_existing_log(path: Path, *, force: bool) -> None:
+    """SourceError if a log is there and no ``force``, or if it has further parts."""
+    from twin.log.part import part_path
+
+    refuse_existing(path, force=force)
+    if (second := part_path(path, 1)).exists():
+        raise SourceError(
+            f"{second}: there is already a log in several parts",
+            "choose another name, or remove all its parts",
+        )
+
+
 @contextmanager
 def _complete_file(path: Path) -> Iterator[Path]:
-    """Give a draft to write to; ``path`` appears only on success, and is never overwritten."""
-    if path.exists():
-        message = f"{path}: there is already a file of that name"
-        raise SourceError(message, "choose another name, or remove it")
+    """Give a draft to write to; it gets the name ``path`` only on success."""
     draft = path.with_name(f"{path.name}.part")
     with suppress(OSError):
         draft.unlink()  # left by a killed command
     try:
         yield draft
-        draft.rename(path)
+        draft.replace(path)
     finally:
         with suppress(OSError):
             draft.unlink()
@@ -137,13 +151,16 @@ def _complete_file(path: Path) -> Iterator[Path]:
 def export(
     log: LogFile,
     output: Annotated[Path, output_option(".csv", ".parquet")],
+    *,
+    force: Force = False,
 ) -> None:
     """Write a log as a table for other programs, lossless."""
     from twin.log.reader import open_log
     from twin.tables.export import ROWS
     from twin.tables.export import export as write_table
 
+    refuse_existing(output, force=force)
     recorded = open_log(log)
     say_if_cut(recorded, log, "exported")
     rows = rows_progress(recorded.blocks(ROWS), "exporting")
-    write_table(rows, recorded.header, output)
+    write_table(rows, recorded.header, output, force=force)

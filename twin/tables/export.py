@@ -12,7 +12,7 @@ import pyarrow as pa
 from pyarrow import csv, parquet
 
 from twin.errors import SourceError
-from twin.files import require_ending
+from twin.files import refuse_existing, require_ending
 from twin.log.header import LogHeader
 from twin.signals import (
     BAR,
@@ -114,14 +114,14 @@ _FIELDS = {
 }
 
 
-def export(rows: Rows, header: LogHeader, path: Path) -> None:
+def export(rows: Rows, header: LogHeader, path: Path, *, force: bool = False) -> None:
     """Write rows of a log as CSV or Parquet, by the suffix of ``path``, one block in memory.
 
     The file appears once it is complete, or not at all. ConfigError for another suffix,
-    SourceError if there is a file of that name or it cannot be written.
+    SourceError if there is a file of that name and no ``force``, or it cannot be written.
     """
     write = _KINDS[require_ending(path, *_KINDS)]
-    with complete_file(path) as file:
+    with complete_file(path, force=force) as file:
         write(rows, header, file)
 
 
@@ -172,11 +172,9 @@ def _origin(header: LogHeader) -> dict[str, str]:
 
 
 @contextmanager
-def complete_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which gets its name once it is complete."""
-    if path.exists():
-        message = f"{path}: there is already a file of that name"
-        raise SourceError(message, "choose another name, or remove it")
+def complete_file(path: Path, *, force: bool = False) -> Iterator[BinaryIO]:
+    """A file to write to, which gets its name once it is complete; ``force`` replaces another."""
+    refuse_existing(path, force=force)
     draft = path.with_name(f"{path.name}.part")
     try:
         try:
@@ -184,7 +182,7 @@ def complete_file(path: Path) -> Iterator[BinaryIO]:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-            draft.rename(path)
+            draft.replace(path)
         finally:
             draft.unlink(missing_ok=True)
     except OSError as error:

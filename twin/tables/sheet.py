@@ -24,11 +24,12 @@ TIME = "yyyy-mm-dd hh:mm:ss.000"
 _FORMULA = r"^([=+\-@\t\r])"
 
 
-def export(table: pa.Table, path: Path) -> None:
+def export(table: pa.Table, path: Path, *, force: bool = False) -> None:
     """Write a table in the format of the suffix, completely or not at all; times are UTC.
 
     The unit of a column is its field's metadata ``unit``. ConfigError for another suffix or too
-    many rows, SourceError if there is a file of that name or it cannot be written.
+    many rows. SourceError if there is a file of that name and no ``force``, or it cannot be
+    written.
     """
     write = _KINDS[require_ending(path, *_KINDS)]
     if write is _write_sheet and table.num_rows > MOST_ROWS:
@@ -36,7 +37,7 @@ def export(table: pa.Table, path: Path) -> None:
             f"{path}: {table.num_rows} rows are more than a sheet holds ({MOST_ROWS})",
             "take fewer days, or *.csv",
         )
-    with complete_file(path) as file:
+    with complete_file(path, force=force) as file:
         write(table, file)
 
 
