@@ -46,7 +46,7 @@ th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px s
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.6rem; }
 dt { color: #444; }
 dd { margin: 0; overflow-wrap: anywhere; }
-thead th { border-bottom: 2px solid #888; font-weight: 600; }
+thead :is(th, td) { border-bottom: 2px solid #888; font-weight: 600; }
 tbody th { font-weight: 400; white-space: nowrap; }
 td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
