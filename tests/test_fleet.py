@@ -109,6 +109,9 @@ def test_a_broken_log_costs_only_itself(
     ]
     assert "not an MCAP file" in page.read_text(encoding="utf-8")
     assert "1 of 3 logs done, 0 were known, 2 could not be" in said.out
+    german = ("fleet", "report", "--assets", tmp_path / "f.sqlite", "-o", page, "--language", "de")
+    assert twin(monkeypatch, *german) == 0
+    assert "<h1>1 Gerät: keines fällt auf, 1 nicht beurteilbar</h1>" in page.read_text()
     assert str(damaged) in said.err
     assert str(foreign) in said.err
     assert "Traceback" not in said.err

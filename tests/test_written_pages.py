@@ -3,8 +3,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rigs
 from accessible import violations
+from calibrations import log_of
+from command_line import twin
 from playwright.sync_api import Browser
 from test_fleet_report import some_of_all
 from test_report import explained
@@ -16,6 +20,8 @@ from twin.diagnosis.report import write_report
 from twin.diagnosis.retelling import templates
 from twin.fleet.text import write_page as write_fleet
 from twin.languages import language_of
+from twin.log.recorder import Recorder
+from twin.signals import TICK
 
 PAGES = ("good", "usable", "refused", "fleet", "report")
 WIDTHS = (390, 820, 1400)
@@ -54,6 +60,26 @@ def test_a_german_page_is_german_in_each_word_and_number(name: str, tmp_path: Pa
 
 SAME = {"mbar", "sl/min", "few", "why", "cut", "two", "empty", "other"}  # units, and what is given
 SAME |= {f"gripper-{number:02d}" for number in range(10)}
+
+
+def test_a_commissioning_writes_its_page_in_the_language_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        "twin.calibration.commission.commission", lambda *_arguments: commissioned("refused")
+    )
+    log, page = tmp_path / "log.mcap", tmp_path / "a.html"
+    recorder = Recorder(log, rigs.config("test_rig").log_header())
+    samples = log_of("test_rig")[:1000]
+    recorder.write(samples, np.zeros(len(samples), TICK), [])
+    recorder.close()
+    command = ("commission", log, "--id", "gripper-7", "-o", page)
+    assert twin(monkeypatch, *command, "--language", "ed") == 2
+    assert 'there are no texts in "ed"' in capsys.readouterr().err
+    assert not page.exists()
+    assert twin(monkeypatch, *command, "--language", "de") == 2  # as it is refused
+    assert "refused: the twin is off by more" in capsys.readouterr().out  # the terminal is English
+    assert "Abgelehnt – compact-ejector-35 gripper-7" in page.read_text(encoding="utf-8")
 
 
 def test_the_verdict_says_what_follows_in_german(tmp_path: Path) -> None:
