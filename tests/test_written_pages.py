@@ -124,5 +124,9 @@ def test_axe_finds_no_violation_and_no_width_is_too_small(
             page = browser.new_page(viewport={"width": width, "height": 800})
             page.goto(url)
             assert page.evaluate("document.documentElement.scrollWidth") <= width, (name, width)
+            scrolled = page.evaluate(
+                "[...document.querySelectorAll('.wide')].some(e => e.scrollWidth > e.clientWidth)"
+            )
+            assert not scrolled or width < 820, (name, width)
             assert violations(page) == [], (name, width)
             page.close()

@@ -52,7 +52,7 @@ td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
 .number { text-align: right; font-variant-numeric: tabular-nums; max-width: 14rem; }
 @media (max-width: 56rem) {
-  th, td { padding-right: .9rem; }
+  th, td { padding-right: .6rem; }
   td, td:nth-child(2) { min-width: 0; }
 }
 @media (max-width: 40rem) {
@@ -60,7 +60,6 @@ td:nth-child(2) { min-width: 7rem; }
   dl, article dl { grid-template-columns: fit-content(9rem) 1fr; gap: .2rem .8rem; }
   tbody th { white-space: normal; }
   table { font-size: .88rem; }
-  th, td { padding-right: .7rem; }
 }
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }
