@@ -1,5 +1,6 @@
 """The table of effects: as promised to the outside, and each one acts as an effect must."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -15,11 +16,14 @@ from twin.errors import ConfigError
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import coefficients
-from twin.model.effects import EFFECTS, Law, apply, table
+from twin.model.effects import EFFECTS, WEATHER, Law, apply, standing_for, table
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.monitor.model_bank import SUSPECTS
+from twin.monitor.scatter_covariance import SCATTERING
 from twin.signals import BAR, MBAR, MS, Command, Phase
+
+TWIN = Path(__file__).parents[1] / "twin"
 
 # What people, scripts and other systems hold on to.
 CONTRACT = """
@@ -360,3 +364,80 @@ def test_weather_and_set_up_alone_cannot_be_mended() -> None:
     fixed = {effect.name for effect in EFFECTS.values() if not effect.can_be_mended}
     assert fixed == {"ambient_pressure", "heat_exchange"}
     assert {suspect.effect for suspect in SUSPECTS if suspect.often < 1.0} == fixed
+
+
+# --- an effect is one entry ---------------------------------------------------------------------
+
+# Words that are also names of effects but mean something else there, by file below twin/.
+OTHER_MEANINGS = {
+    # "leakage" is the key figure (mbar/s) of a cycle, with limits and warnings of its own.
+    "alarms/limits.py": {"leakage"},
+    "figures/cycle.py": {"leakage"},
+    "figures/settings.py": {"leakage"},
+    "figures/table.py": {"leakage"},
+    "figures/text.py": {"leakage"},
+    "figures/warnings.py": {"leakage"},
+    "page/plant_overview_text.py": {"leakage"},
+}
+TABLE = "model/effects.py"
+
+
+def quoted_effects(source: str) -> set[str]:
+    """Names of effects, also before a parameter's, that a module has as strings of its own."""
+    strings = (node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant))
+    return {text.split(".")[0] for text in strings if isinstance(text, str)} & set(EFFECTS)
+
+
+def test_no_module_asks_for_an_effect_by_its_name() -> None:
+    """What depends on an effect is declared in its entry; there it is read from.
+
+    A new effect is then one entry in the table, and its truth in the simulated worlds.
+    """
+    modules = {
+        path.relative_to(TWIN).as_posix(): quoted_effects(path.read_text(encoding="utf-8"))
+        for path in TWIN.rglob("*.py")
+    }
+    assert modules.pop(TABLE) == set(EFFECTS)
+    assert {module: names for module, names in modules.items() if names} == OTHER_MEANINGS
+
+
+@each_parameter
+def test_a_parameter_touches_what_it_declares(name: str, parameter) -> None:
+    """In any law, on a unit on which all laws act; the law's own coefficient is not its doing."""
+    theta = rigs.theta("gripper")
+    theta[c.GAUGE], theta[c.EXHAUST] = 1.0, 1e-4
+    theta[c.NEAR_RESISTANCE] = theta[c.PLACE] * 2.0 + 1.0
+    touched: set[int] = set()
+    for place in (0.0, theta[c.NEAR_RESISTANCE]):
+        theta[c.PLACE] = place  # of the sensor: before, and behind the near resistance
+        for law in EFFECTS[name].laws():
+            unchanged = apply(theta, name, law)
+            size = parameter.neutral(theta) + parameter.typical
+            changed = apply(theta, name, {**law, parameter.name: size})
+            differs = (changed != unchanged) & ~np.isnan(theta)
+            touched |= set(np.flatnonzero(differs).tolist())
+    assert touched == set(parameter.touches)
+
+
+def test_an_effect_is_found_by_what_it_stands_for() -> None:
+    for name, parameter in PARAMETERS:
+        effect, standing = standing_for(parameter.touches[0])
+        assert (effect.name, standing) == (name, parameter)
+
+
+def test_weather_is_the_effect_on_ambient_pressure() -> None:
+    assert [name for name, effect in EFFECTS.items() if effect.is_weather] == [WEATHER]
+    assert EFFECTS[WEATHER].parameters[0].touches[0] == c.AMBIENT
+
+
+def test_what_scatters_is_declared_by_the_entries() -> None:
+    """Delays stand last, as a diagnosis takes the columns; healthy data are stored by name."""
+    assert list(SCATTERING) == [
+        "supply_pressure_drop",
+        "leakage",
+        "response_delay",
+        "blow_off_delay",
+    ]
+    for name, parameter in SCATTERING.items():
+        assert parameter in EFFECTS[name].parameters
+        assert 0.0 < parameter.healthy_sigma < parameter.typical

@@ -32,7 +32,9 @@ from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.language import numeral, tr
+from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, sensor_place
+from twin.model.effects import standing_for
 from twin.model.gas import GAMMA, R
 from twin.model.system import Cups, Part, Sensor, Tube, volume
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
@@ -319,7 +321,8 @@ def _ambient(tables: dict[str, dict[str, Any]], readings: Readings) -> tuple[flo
     if abs(offset) <= APART / MBAR:  # within the error of a sensor
         tables["ambient"]["pressure_mbar"] = round(readings.barometer / MBAR, 1)
         if abs(offset) > LEAST_OFFSET:
-            tables["effects"]["sensor_offset"] = {"offset": round(offset, 1)}
+            zero_error, parameter = standing_for(c.SENSOR_OFFSET)
+            tables["effects"][zero_error.name] = {parameter.name: round(offset, 1)}
         return readings.idle / MBAR, []
     measured = round(readings.idle / MBAR, 1)
     tables["ambient"]["pressure_mbar"] = measured

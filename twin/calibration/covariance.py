@@ -14,6 +14,7 @@ from twin.calibration.cycles import Cycles
 from twin.inference.covariance import Covariance, add_independent, fading, low_rank
 from twin.inference.sensitivities import coefficients_at, sensitivities
 from twin.model import theta as c
+from twin.model.effects import standing_for
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.scatter_covariance import SCATTER
@@ -67,7 +68,8 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     ``noise`` (Pa) is the sensor's.
     """
     bins = cycles.bins
-    volume_change = ("added_volume", {"volume": VOLUME * theta[c.VOLUME] / ML})
+    more_volume, parameter = standing_for(c.VOLUME)
+    volume_change = (more_volume.name, {parameter.name: VOLUME * theta[c.VOLUME] / ML})
     scatter_changes = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
     sigmas = [volume_change, *scatter_changes]
     off, moves = sensitivities(

@@ -10,7 +10,8 @@ from twin.calibration.covariance import weighted
 from twin.calibration.cycles import Cycles
 from twin.errors import ConfigError
 from twin.inference.sensitivities import coefficients_at, inside, sensitivities
-from twin.model.effects import EFFECTS, Parameter
+from twin.model import theta as c
+from twin.model.effects import EFFECTS, Parameter, standing_for
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 from twin.signals import MBAR
@@ -25,7 +26,7 @@ PARTED = 0.8
 EACH = 3  # cycles at least, before and after
 LEAST_PARTED = 2.0 * MBAR  # Pa rms
 COMMON = 0.8  # share of the cycles that must have a bin for it to be compared
-LEVELS = {"h1_level": "h1_shift", "h1_low_level": "h2_shift"}  # figures, and parameters of them
+LEVELS = {"h1_level": c.H1, "h1_low_level": c.H1_LOW}  # figures, and coefficients of them
 
 
 @dataclass(frozen=True)
@@ -131,10 +132,9 @@ def _pressure_steps(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step
 
 def _level_steps(figures: Sequence[Mapping[str, float]]) -> Iterator[Step]:
     """The clearest step of each threshold, which shows only in where the nozzle switches."""
-    drift = EFFECTS["threshold_drift"]
-    for figure, name in LEVELS.items():
+    for figure, threshold in LEVELS.items():
         levels = np.array([values[figure] for values in figures if figure in values])
-        parameter = next(values for values in drift.parameters if values.name == name)
+        drift, parameter = standing_for(threshold)
         if len(levels) == len(figures):
             yield _clearest_step(drift.name, parameter, levels / parameter.typical, 1.0, before=1)
 

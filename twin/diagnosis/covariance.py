@@ -22,17 +22,18 @@ from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
 from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
-from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.scatter_covariance import SCATTERING, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.statistics import LEVELS
 from twin.signals import MS, Phase
 
-# Delays of valves: the response of an edge is not linear in them.
-_ACTS = {"response_delay": c.RESPONSE, "blow_off_delay": c.BLOW_OFF_RESPONSE}
+# Delays that scatter, each with the time at which its valve opens: the response of an edge is not
+# linear in them.
+_OPENS = {name: p.touches[0] for name, p in SCATTERING.items() if p.is_time}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
 KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
 # Columns of ``moved`` for that: knees of a cycle are independent.
-KNEES = [len(SCATTER) + len(_CLOSES), -1]
+KNEES = [len(SCATTERING) + len(_CLOSES), -1]
 # Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
 # seen any of what another weather leaves open.
 UNSEEN = 3.0
@@ -188,7 +189,7 @@ def moved(
     each pair counts.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
-    delays = [(_ACTS[name], size) for name, (_, size) in sizes.items() if name in _ACTS]
+    delays = [(_OPENS[name], size) for name, (_, size) in sizes.items() if name in _OPENS]
     times = [*delays, *((closes, CLOSING_MS) for closes in _CLOSES)]
     steady = steady[: len(steady) - len(delays)]
     knee_shift = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
@@ -224,7 +225,7 @@ def _with_delay(theta: Theta, coefficient: int, size: float, sign: int) -> Theta
 def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
     """Scattering effects: effect to parameter and one sigma."""
     learned = evidence.healthy.scatter
-    return {name: (key, learned.get(name, size)) for name, (key, size) in SCATTER.items()}
+    return {name: (p.name, learned.get(name, p.healthy_sigma)) for name, p in SCATTERING.items()}
 
 
 # --- levels: one row for each that a cycle shows --------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.inference.priors import PRIOR_TEMPER
 from twin.model.courses import HOUR, Cause, Course
-from twin.model.effects import EFFECTS, WEATHER, Effect, Parameter, effect_of
+from twin.model.effects import EFFECTS, Effect, Parameter, effect_of
 from twin.monitor.bins import Floats
 
 LOCAL_ONSETS = 20  # onsets in a cycle that can be told apart
@@ -115,4 +115,4 @@ def _price(evidence: Evidence, cause: Cause) -> float:
         )
         alternatives *= 2.0 * math.comb(cycles, acting_cycles)
     cost = 2.0 * len(effect.parameters) + 2.0 * math.log(alternatives)
-    return cost + float(sizes(evidence, (cause,))[0]) ** 2 if effect.name == WEATHER else cost
+    return cost + float(sizes(evidence, (cause,))[0]) ** 2 if effect.is_weather else cost

@@ -16,6 +16,7 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.inference.unmodelled import hats, knots_over
 from twin.model import theta as c
 from twin.model.courses import Cause
+from twin.model.effects import standing_for
 from twin.model.term import KINDS, Term
 from twin.monitor.bins import Bins, Floats, unwarped
 from twin.signals import MBAR, MS
@@ -155,7 +156,8 @@ def _worst(evidence: Evidence, residual: _Residual) -> str:
 
 def _driver(evidence: Evidence, off: Floats) -> str:
     """What an effect that differs from cycle to cycle follows: the measured supply, or time."""
-    drop = (Cause("supply_pressure_drop", {"drop": DROP_BAR}),)
+    lower_supply, parameter = standing_for(c.SUPPLY)
+    drop = (Cause(lower_supply.name, {parameter.name: DROP_BAR}),)
     moves = np.diff(evidence.off([HEALTHY, drop]), axis=1)[:, 0]
     sizes, supplies = [], []
     for cycle in evidence.judged:

@@ -26,8 +26,6 @@ from twin.signals import Phase
 Where = Literal["inside", "outside"]  # the vessel: part of the FMU, or somebody else's
 
 PHASES = {phase.name.lower(): int(phase) for phase in Phase}
-# Effects that act on the vessel alone; an FMU without the vessel does not have them.
-OF_THE_VESSEL = ("added_volume", "cup_compliance", "heat_exchange")
 # Coefficients that are ports and settings, in C over the values ``v``.
 _PORTS = {
     "AMBIENT": "v[V_AMBIENT_PRESSURE]",
@@ -133,7 +131,9 @@ class Component:
         unlisted = {name: sizes for name, sizes in data.effects.items() if name not in EFFECTS}
         theta = coefficients(data.model_copy(update={"effects": unlisted}))
         names = [*listed, *(name for name in EFFECTS if name not in listed)]
-        available = [name for name in names if where == "inside" or name not in OF_THE_VESSEL]
+        available = [
+            name for name in names if where == "inside" or not _is_of_vessel(EFFECTS[name])
+        ]
         effect_variables = _effect_variables(theta, data.effects, available)
         sources = {**_PORTS, **_VESSEL[where]}
         for variable, number in effect_variables:
@@ -159,6 +159,11 @@ class Component:
     def parameters(self) -> tuple[Variable, ...]:
         """The variables of a parameter set."""
         return tuple(variable for variable in self.variables if variable.is_parameter)
+
+
+def _is_of_vessel(effect: Effect) -> bool:
+    """Whether an effect acts on the vessel alone: an FMU without the vessel does not have it."""
+    return {list(COEFFICIENTS)[number] for number in effect.touches} <= _VESSEL["outside"].keys()
 
 
 def _effect_variables(

@@ -19,7 +19,7 @@ from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.control import PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, coefficients
-from twin.model.effects import apply
+from twin.model.effects import apply, standing_for
 from twin.model.theta import Theta
 from twin.monitor.healthy import Healthy
 from twin.monitor.uncertain_data import drawn
@@ -63,7 +63,8 @@ class Setting:
     def act(self, theta: Theta, now: "Setting") -> Theta:
         """Coefficients with this setting; ``theta`` has the setting ``now``."""
         drop = now.supply - self.supply
-        theta = apply(theta, "supply_pressure_drop", {"drop": drop}) if drop else theta.copy()
+        lower_supply, parameter = standing_for(c.SUPPLY)
+        theta = apply(theta, lower_supply.name, {parameter.name: drop})
         theta[c.H1] += (self.h1 - now.h1) * MBAR
         theta[c.H1_LOW] += (self.h1 - self.hysteresis - now.h1 + now.hysteresis) * MBAR
         return theta

@@ -2,7 +2,7 @@
 
 import math
 
-from twin.model.effects import WEATHER, Effect
+from twin.model.effects import Effect
 
 # Exponent of the prior frequencies in a probability: a ratio of a thousand counts as ten, as sites
 # differ. Chosen.
@@ -16,5 +16,5 @@ def tempered(effect: Effect, *, ambient_is_measured: bool) -> float:
 
 def penalty(effect: Effect, size: float, *, ambient_is_measured: bool) -> float:
     """Prior penalty (chi-square) of an effect in ``size`` (in typical ones), beside wear."""
-    of_size = size**2 if effect.name == WEATHER else 0.0
+    of_size = size**2 if effect.is_weather else 0.0
     return of_size - 2.0 * math.log(tempered(effect, ambient_is_measured=ambient_is_measured))

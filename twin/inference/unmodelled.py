@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.inference.covariance import Floats
 from twin.inference.priors import tempered
-from twin.model.effects import WEATHER, Effect
+from twin.model.effects import Effect
 
 MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # How probable things are beforehand, beside a single listed effect. Chosen: something that is not
@@ -55,7 +55,7 @@ class Odds:
         Courses are averaged. Weather acts on everything, and no model's laws are quite those of the
         rig: it leaves as much as a twin leaves on another day.
         """
-        expected = _TWIN if cause.name == WEATHER else _LITTLE
+        expected = _TWIN if cause.is_weather else _LITTLE
         frequency = tempered(cause, ambient_is_measured=ambient_is_measured)
         return cls(_ratio(log_likelihoods, expected), frequency)
 

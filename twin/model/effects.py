@@ -16,7 +16,6 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 FLATTEST = 0.9  # of the volume: cups that give way do not vanish
 # How often an effect comes, beside what wears: that is taken for once in two years.
 WEEKLY, SELDOM = 100.0, 0.1
-WEATHER = "ambient_pressure"  # its typical size is one sigma of the weather
 UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 
 
@@ -34,12 +33,18 @@ class Parameter:
     low: float
     high: float
     typical: float
+    # Numbers of the coefficients that it changes, none for a mechanism, which acts on any. The
+    # first is the one that it stands for: of a valve's delay, when that opens.
+    touches: tuple[int, ...] = ()
     coefficient: int | None = None
     ratio: bool = False  # what matters is how many times as large it is: a time constant
     usual: float | None = None  # of what shapes an effect that was seen before
     is_of_the_log: bool = False  # a phase: another log has another one
     # Of an estimate, one sigma: from the scale of the data set, that is, of volume and suction.
     relative_error: float = 0.03
+    # One sigma by which it differs from cycle to cycle in a healthy ejector, in its unit, until a
+    # better one is learned; 0: it does not.
+    healthy_sigma: float = 0.0
 
     @property
     def is_time(self) -> bool:
@@ -117,13 +122,26 @@ class Effect:
     law: Law | None = None
     can_be_mended: bool = True
 
+    @property
+    def touches(self) -> frozenset[int]:
+        """Numbers of the coefficients that its parameters change."""
+        return frozenset(number for p in self.parameters for number in p.touches)
+
+    @property
+    def is_weather(self) -> bool:
+        """Whether it is another ambient pressure.
+
+        Its typical size is one sigma of the weather, and a barometer shows it.
+        """
+        return c.AMBIENT in self.touches
+
     def laws(self) -> list[dict[str, float]]:
         """The laws that it may act by, as values beside those of its parameters."""
         return [{self.law.name: value} for value in self.law.tried] if self.law else [{}]
 
     def frequency(self, *, ambient_is_measured: bool) -> float:
         """Prior frequency, over that of wear; measured weather is followed, so hardly a cause."""
-        is_followed = ambient_is_measured and self.name == WEATHER
+        is_followed = ambient_is_measured and self.is_weather
         return min(self.often, 1.0) if is_followed else self.often
 
 
@@ -225,28 +243,28 @@ _TABLE = (
         "leakage",
         "Air leaks in through an opening on the vacuum side",
         "hoses, fittings and cups: a cut, or a loose connection",
-        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
+        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0, (c.LEAK,), healthy_sigma=0.03),),
         _leakage,
     ),
     Effect(
         "porous_leakage",
         "Air seeps in through a porous part or seal, the more the higher the vacuum",
         "the part's surface and the sealing lips; try a dense part",
-        (_P("flow_at_600mbar", "sl/min", 0.0, 60.0, 1.0),),
+        (_P("flow_at_600mbar", "sl/min", 0.0, 60.0, 1.0, (c.LAMINAR_LEAK,)),),
         _porous_leakage,
     ),
     Effect(
         "check_valve_leak",
         "Air flows back through the ejector while its nozzle is off",
         "the ejector's check valve: dirt on its seat",
-        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0),),
+        (_P("sonic_flow", "sl/min", 0.0, 60.0, 1.0, (c.BACK_FLOW,)),),
         _check_valve_leak,
     ),
     Effect(
         "suction_loss",
         "The ejector moves less air at every vacuum: worn or dirty nozzle",
         "the nozzles and the silencer: clean or replace them",
-        (_P("loss", "%", 0.0, 90.0, 10.0),),
+        (_P("loss", "%", 0.0, 90.0, 10.0, (c.SUCTION, c.RELIEF, c.EXHAUST)),),
         _suction_loss,
         # A worn nozzle, or dirt in the tube that blow-off leaves through as well.
         law=Law("exhaust_follows", c.EXHAUST_FOLLOWS, (0.0, 1.0)),
@@ -255,14 +273,14 @@ _TABLE = (
         "end_vacuum_loss",
         "The highest vacuum it can reach is lower: worn receiver nozzle or clogged silencer",
         "the receiver nozzle for wear, the silencer for dirt",
-        (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0),),
+        (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0, (c.END_RATIO,)),),
         _end_vacuum_loss,
     ),
     Effect(
         "supply_pressure_drop",
         "The operating pressure is too low: suction, end vacuum and blow-off weaken together",
         "the supply pressure at the ejector while its nozzle is on",
-        (_P("drop", "bar", 0.0, 4.0, 0.4),),
+        (_P("drop", "bar", 0.0, 4.0, 0.4, (c.SUPPLY, c.END_RATIO), healthy_sigma=0.02),),
         _supply_pressure_drop,
         # One nozzle's end pressure hardly moves, another's doubles with a bar less: healthy cycles
         # are of one supply. Momentum theory of ejectors on the market has 0.1 to 2 per bar.
@@ -272,7 +290,16 @@ _TABLE = (
         "filter_clogging",
         "A clogged filter throttles the flow between vessel and ejector",
         "the vacuum filter: clean or replace it",
-        (_P("pressure_drop_at_nominal", "mbar", 0.0, 800.0, 40.0),),
+        (
+            _P(
+                "pressure_drop_at_nominal",
+                "mbar",
+                0.0,
+                800.0,
+                40.0,
+                (c.RESISTANCE, c.NEAR_RESISTANCE, c.PLACE),
+            ),
+        ),
         _filter_clogging,
         # In the line behind the sensor, or in the ejector with the sensor behind it.
         law=Law("filter_before_sensor", c.FILTER_AT, (0.0, 1.0)),
@@ -281,14 +308,14 @@ _TABLE = (
         "added_volume",
         "More volume than configured: a longer hose or a bigger cup",
         "hose length and cups against what is configured",
-        (_P("volume", "ml", 0.0, 5000.0, 20.0),),
+        (_P("volume", "ml", 0.0, 5000.0, 20.0, (c.VOLUME,)),),
         _added_volume,
     ),
     Effect(
         "cup_compliance",
         "The cups give way: their volume shrinks as vacuum rises",
         "the cups: worn, soft, or of another kind",
-        (_P("volume_at_full_vacuum", "ml", 0.0, 100.0, 10.0),),
+        (_P("volume_at_full_vacuum", "ml", 0.0, 100.0, 10.0, (c.COMPLIANCE,)),),
         _cup_compliance,
     ),
     Effect(
@@ -296,7 +323,18 @@ _TABLE = (
         "Heat passes between gas and wall at another rate than the data set says",
         "what changed about the vessel; if nothing did, calibrate again",
         # How the heat of the wall is shared between vessel and line is uncertain.
-        (_P("film_coefficient", "W/(m²·K)", 0.0, 500.0, 5.0, c.FILM, relative_error=0.1),),
+        (
+            _P(
+                "film_coefficient",
+                "W/(m²·K)",
+                0.0,
+                500.0,
+                5.0,
+                (c.FILM,),
+                coefficient=c.FILM,
+                relative_error=0.1,
+            ),
+        ),
         _heat_exchange,
         can_be_mended=False,
     ),
@@ -304,14 +342,24 @@ _TABLE = (
         "response_delay",
         "The suction valve acts later",
         "the suction valve and the output that drives it",
-        (_P("delay", "ms", 0.0, 400.0, 10.0),),
+        (
+            _P(
+                "delay",
+                "ms",
+                0.0,
+                400.0,
+                10.0,
+                (c.RESPONSE, c.RESPONSE_OFF),
+                healthy_sigma=0.5,
+            ),
+        ),
         _response_delay,
     ),
     Effect(
         "slow_ramp_up",
         "The jet takes longer to reach full suction",
         "the suction valve and the supply hose: something opens slowly",
-        (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
+        (_P("time_constant", "ms", 0.0, 400.0, 20.0, (c.SLOW_RAMP_UP,)),),
         _slow_ramp_up,
         # The jet grows with the valve's opening, or is there long before it is open.
         law=Law("jet_full_at", c.JET_FULL_AT, (1.0, 0.5, 0.2, 0.08)),
@@ -321,8 +369,8 @@ _TABLE = (
         "The switching points of the air saving moved",
         "the air saving's settings H1 and H2 in the ejector",
         (
-            _P("h1_shift", "mbar", -200.0, 200.0, 20.0),
-            _P("h2_shift", "mbar", -200.0, 200.0, 20.0),
+            _P("h1_shift", "mbar", -200.0, 200.0, 20.0, (c.H1,)),
+            _P("h2_shift", "mbar", -200.0, 200.0, 20.0, (c.H1_LOW,)),
         ),
         _threshold_drift,
         acts=_saves_air,
@@ -331,21 +379,31 @@ _TABLE = (
         "weak_blow_off",
         "The blow-off flow is too small",
         "the blow-off valve and its throttle screw",
-        (_P("loss", "%", 0.0, 95.0, 20.0),),
+        (_P("loss", "%", 0.0, 95.0, 20.0, (c.BLOW_OFF,)),),
         _weak_blow_off,
     ),
     Effect(
         "blow_off_delay",
         "The blow-off valve acts later",
         "the blow-off valve and the output that drives it",
-        (_P("delay", "ms", 0.0, 400.0, 10.0),),
+        (
+            _P(
+                "delay",
+                "ms",
+                0.0,
+                400.0,
+                10.0,
+                (c.BLOW_OFF_RESPONSE, c.BLOW_OFF_RESPONSE_OFF),
+                healthy_sigma=0.5,
+            ),
+        ),
         _blow_off_delay,
     ),
     Effect(
         "sensor_offset",
         "The pressure sensor reads a constant amount off (positive: too much absolute pressure)",
         "the sensor's zero: what it reads while open to ambient",
-        (_P("offset", "mbar", -200.0, 200.0, 8.0),),
+        (_P("offset", "mbar", -200.0, 200.0, 8.0, (c.SENSOR_OFFSET,)),),
         _sensor_offset,
         SELDOM,
     ),
@@ -353,7 +411,7 @@ _TABLE = (
         "sensor_gain",
         "The span of the pressure sensor is off (positive: it reads too much vacuum)",
         "the sensor's span: compare it with a gauge at high vacuum",
-        (_P("error", "%", -30.0, 30.0, 2.0),),
+        (_P("error", "%", -30.0, 30.0, 2.0, (c.SENSOR_GAIN,)),),
         _sensor_gain,
         SELDOM,
     ),
@@ -361,14 +419,23 @@ _TABLE = (
         "sensor_lag",
         "The pressure sensor is slow, or its tube is long",
         "the sensor's tube for length, water and dirt, and its filter setting",
-        (_P("time_constant", "ms", 0.0, 400.0, 20.0),),
+        (_P("time_constant", "ms", 0.0, 400.0, 20.0, (c.SLOW_SENSOR,)),),
         _sensor_lag,
     ),
     Effect(
         "ambient_pressure",
         "Ambient pressure differs from the data set: weather or altitude",
         "today's air pressure against that of the data set",
-        (_P("shift", "mbar", -300.0, 100.0, 15.0),),
+        (
+            _P(
+                "shift",
+                "mbar",
+                -300.0,
+                100.0,
+                15.0,
+                (c.AMBIENT, c.SENSOR_OFFSET, c.H1, c.H1_LOW),
+            ),
+        ),
         _ambient_pressure,
         WEEKLY,
         # The ejector's own sensor counts from ambient pressure, or from zero.
@@ -379,6 +446,21 @@ _TABLE = (
 
 EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in _TABLE}
 
+
+def standing_for(coefficient: int) -> tuple[Effect, Parameter]:
+    """The effect of the table, and its parameter, that stands for a change of a coefficient.
+
+    StopIteration if there is none.
+    """
+    return next(
+        (effect, parameter)
+        for effect in _TABLE
+        for parameter in effect.parameters
+        if parameter.touches[:1] == (coefficient,)
+    )
+
+
+WEATHER = standing_for(c.AMBIENT)[0].name  # the effect that ``is_weather``
 
 _BESIDE: dict[str, Effect] = {}  # what acts beside the table
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 
 from twin.model import theta as c
-from twin.model.effects import apply
+from twin.model.effects import apply, standing_for
 from twin.model.theta import Theta
 from twin.signals import MBAR
 
@@ -52,7 +52,8 @@ def unsure(
 
 def _in_air_of(theta: Theta, shift: float) -> Theta:
     """``theta`` with ambient pressure ``shift`` (Pa) above the measured or assumed one."""
-    return apply(theta, "ambient_pressure", {"shift": shift / MBAR})
+    weather, parameter = standing_for(c.AMBIENT)
+    return apply(theta, weather.name, {parameter.name: shift / MBAR})
 
 
 def of_the_day(calibrated: Theta, present: Theta, ambient: float) -> Iterator[Way]:

@@ -16,7 +16,7 @@ from twin.model import theta as c
 from twin.model.catalogue import effects_in
 from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
-from twin.model.effects import EFFECTS, WEATHER, Effect, Parameter, apply
+from twin.model.effects import EFFECTS, Effect, Parameter, apply
 from twin.model.theta import Theta
 from twin.monitor.another_day import of_the_day
 from twin.monitor.bins import Floats, Ints, sparse_rows
@@ -91,13 +91,16 @@ def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
 # Relative sigmas of how suction and end pressure follow the supply. These values are the type's,
 # since only one supply was measured; so the effect of a low supply is uncertain.
 UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
-SUPPLY = "supply_pressure_drop"
-UNCERTAIN_LAWS = (SUPPLY, WEATHER)
+# So is that of another ambient pressure: it changes the ratio of the supply to it as well.
+UNCERTAIN_LAWS = frozenset(
+    effect.name for effect in EFFECTS.values() if {c.SUPPLY, c.AMBIENT} & effect.touches
+)
 UNCERTAIN = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.effect in UNCERTAIN_LAWS)
 DELAYS = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.delays)
 LARGER = len(DELAY_STEPS) - 1  # further sizes of a delay
-# With a step of these effects, a switching of the air saving shows a row later than it acts.
-SEEN_LATER = {Phase.HOLD: ("sensor_lag",), Phase.SUCTION: ("sensor_lag", "slow_ramp_up")}
+# A switching of the air saving shows a row later than it acts with a step of an effect on these
+# coefficients: time constants of the sensor, and of the jet while it grows.
+SEEN_LATER = {Phase.HOLD: {c.SLOW_SENSOR}, Phase.SUCTION: {c.SLOW_SENSOR, c.SLOW_RAMP_UP}}
 
 
 def hypotheses(theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> list[Theta]:
@@ -132,7 +135,7 @@ def ways(effect: str, theta: Theta, changed: Theta) -> list[Theta]:
         other = changed.copy()
         other[number] *= 1.0 + share
         varied.append(other)
-    if effect == WEATHER:
+    if EFFECTS[effect].is_weather:
         varied += [up for up, _ in of_the_day(theta, changed, float(changed[c.AMBIENT]))]
     return varied
 
@@ -274,7 +277,9 @@ def _phases(phase: Bytes, after: Bytes, count: int) -> Bytes:
     for entered, before in ((Phase.HOLD, Phase.SUCTION), (Phase.SUCTION, Phase.HOLD)):
         switches = np.flatnonzero((after == entered) & (phase == before))
         later = [
-            1 + i for i, suspect in enumerate(SUSPECTS) if suspect.effect in SEEN_LATER[entered]
+            1 + i
+            for i, suspect in enumerate(SUSPECTS)
+            if SEEN_LATER[entered].intersection(suspect.parameter.touches)
         ]
         phases[switches[:, None], later] = entered
     return phases

@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from twin.events import Event, Kind
-from twin.model.effects import EFFECTS, UNKNOWN
+from twin.model import theta as c
+from twin.model.effects import UNKNOWN, standing_for
 from twin.model.theta import Theta
 from twin.monitor.clock import ClockWatch
 from twin.monitor.cycles import (
@@ -583,10 +584,10 @@ class Monitor:
         if worst.figure.endswith("_level"):  # only the thresholds moved
             if verdict is not None and _has_name(verdict):
                 return verdict.where_changed().causes
-            shift = EFFECTS["threshold_drift"].parameters[0]
+            drift, shift = standing_for(c.H1)
             size = shift.reported(worst.excess, self.theta)
             return [
-                Likeness("threshold_drift", size, shift.unit, LEVELS_ALONE),
+                Likeness(drift.name, size, shift.unit, LEVELS_ALONE),
                 Likeness(UNKNOWN, None, "", 1.0 - LEVELS_ALONE),
             ]
         parts = [cycle] if before is None else [before, cycle]

@@ -16,7 +16,7 @@ from twin.inference.priors import penalty
 from twin.inference.sensitivities import coefficients_at, derivatives
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.model import kernel
-from twin.model.effects import EFFECTS, UNKNOWN, WEATHER, Effect
+from twin.model.effects import EFFECTS, UNKNOWN, Effect
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
@@ -75,7 +75,7 @@ def likenesses(
     rest = np.array([cycle.squares(cycle.off - moves) for moves in moved.T])
     # What a law leaves open must not do the explaining.
     left[rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off)] = np.inf
-    is_weather = np.array([effect.name == WEATHER for effect in effects])
+    is_weather = np.array([effect.is_weather for effect in effects])
     left[is_weather & (np.abs(sizes) > MOST_WEATHER)] = np.inf
     best = int(np.argmin(left))
     if np.isinf(left[best]):

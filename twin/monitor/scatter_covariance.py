@@ -6,18 +6,28 @@ from functools import cache
 import numpy as np
 
 from twin.inference.covariance import add_independent, fading, low_rank
+from twin.model.effects import EFFECTS, Parameter
 from twin.model.term import AGAIN, KINDS
 from twin.monitor.bins import Bins, Floats, Ints, warped
 from twin.monitor.healthy import ModelError
 from twin.signals import MS
 
-# Effects whose sizes scatter from cycle to cycle in a healthy ejector: parameter, and sigma unless
-# a better one was learned.
+# Effects whose sizes scatter from cycle to cycle in a healthy ejector. Delays stand last, as in the
+# columns of a diagnosis; the order of the others decides only how sums over them are rounded.
+SCATTERING: Mapping[str, Parameter] = dict(
+    sorted(
+        (
+            (effect.name, parameter)
+            for effect in EFFECTS.values()
+            for parameter in effect.parameters
+            if parameter.healthy_sigma > 0.0
+        ),
+        key=lambda scattering: (scattering[1].is_time, scattering[1].healthy_sigma),
+    )
+)
+# The same: parameter, and sigma unless a better one was learned.
 SCATTER: Mapping[str, tuple[str, float]] = {
-    "supply_pressure_drop": ("drop", 0.02),
-    "leakage": ("sonic_flow", 0.03),
-    "response_delay": ("delay", 0.5),
-    "blow_off_delay": ("delay", 0.5),
+    name: (parameter.name, parameter.healthy_sigma) for name, parameter in SCATTERING.items()
 }
 KNEE_MBAR = 0.7  # sigma of the level found at a knee, to which the model is set
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
