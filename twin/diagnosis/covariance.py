@@ -151,9 +151,10 @@ def covariance(
     uncertain = (*evidence.uncertain, *_another_day(evidence, ambient))
     off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
-    of_the_day = np.arange(len(uncertain)) >= len(evidence.uncertain)
-    is_weather = any(cause.effect == WEATHER for cause in about)
-    columns = np.tile(of_the_day * float(is_weather), 1 + both_ways)
+    of_weather = np.zeros(len(uncertain))
+    if any(cause.effect == WEATHER for cause in about):
+        of_weather[len(evidence.uncertain) :] = 1.0
+    columns = np.tile(of_weather, 1 + both_ways)
     return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open, columns)
 
 
