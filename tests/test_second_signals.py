@@ -279,6 +279,7 @@ def test_it_is_followed_where_most_rows_have_one() -> None:
 def quickly(samples: Samples, steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Fitted, str]:
     """One round, from a guess that has the sensor where it is, and what was told of it."""
     monkeypatch.setattr(fitting, "NARROWING", (Round(1, 1.0, 1.5 * MBAR, steps, 1e-3),))
+    monkeypatch.setattr(fitting, "AGAIN", ())
     start = next(one for one in starts(first_guess(LONG_LINE), np.nan) if sensor_place(one) < 0.5)
     told_of: list[str] = []
     return fit_from_afar(samples, [start], told_of.append), told_of[-1]
