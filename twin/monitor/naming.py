@@ -33,7 +33,9 @@ STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
 NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
 NOISE = 1.0  # mbar, of a row. Chosen: what is named here is far larger
-MOST_WEATHER = 5.0  # typical sizes of weather: 75 mbar. At no place does the air differ by more
+# Typical sizes of weather: 75 mbar. At one place air pressure differs by less, storms aside; a rig
+# that moved to another altitude has to be commissioned again.
+MOST_WEATHER = 5.0
 EXPLAINED = 0.5  # of the squares, that a name takes away at least: more than it leaves
 
 
