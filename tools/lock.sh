@@ -9,7 +9,7 @@ lock() {
     uv pip compile "$@" --universal --python-version 3.11 --generate-hashes \
         --no-emit-index-url --no-annotate --no-header --quiet --output-file "$out"
 }
-lock requirements.lock pyproject.toml --extra reports --group build
+lock requirements.lock pyproject.toml --extra fleet --extra opcua --extra reports --extra tables --group build
 lock requirements-service.lock pyproject.toml --constraint requirements.lock --group build \
     --extra opcua --extra postgres --extra reports --extra serve
 lock requirements-dev.lock pyproject.toml --constraint requirements.lock --all-extras \
