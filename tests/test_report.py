@@ -669,7 +669,7 @@ def test_healthy_band_is_of_a_mean_and_grows_with_what_healthy_cycles_have() -> 
     both, one = laid_over(here, np.array([4, 6])), laid_over(here, np.array([4]))
     several, single = healthy_sigma(here, both), healthy_sigma(here, one)
     assert several.mean() < 0.95 * single.mean()
-    rough, rougher = (healthy_sigma(with_error(mbar), both) for mbar in (50.0, 100.0))
+    rough, rougher = (healthy_sigma(with_error(mbar), both) for mbar in (100.0, 200.0))
     np.testing.assert_allclose(rougher / rough, 2.0, rtol=0.05)
 
 

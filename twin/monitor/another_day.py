@@ -21,7 +21,9 @@ BAROMETER = 2.0 * MBAR  # Pa, one sigma; cheap ones are within 3 or 4 mbar
 # Pa, one sigma of the pressure sensor's zero: without a barometer, the calibration of an opened
 # system has taken the sensor's reading for ambient.
 ZERO = 2.0 * MBAR
-HALL_K = 10.0  # one sigma if not measured: 15 °C and 35 °C are both within a year's two sigmas
+# K, one sigma of how far apart two unmeasured days are. Each is known to 10 K: 15 °C and 35 °C are
+# both within a year's two sigmas.
+HALL_K = 10.0 * math.sqrt(2.0)
 SMALLEST = 1e-4  # a smaller relative change is left out
 # Coefficients that vary together: suction, blow-off, what it leaves through, leaks, and friction in
 # the line. Blow-off comes from the supply and does not vary with what it leaves through.
