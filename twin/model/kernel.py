@@ -82,6 +82,7 @@ NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE = range(ORDER, 
 ERROR_COEFFICIENT, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
 SET_IN, ACTS, REACHED = ORDER + 11, ORDER + 11 + SLOTS, ORDER + 11 + 2 * SLOTS
 RUN = REACHED + SLOTS
+JUST_OPEN = 1.0 + 1e-9  # of OPEN: the next step takes it for an event, and is finely divided
 STATE = RUN + 1
 
 # Hypotheses that run together with the same steps. LLVM vectorises the loop over them only if it is
@@ -550,7 +551,7 @@ def _enter_phases(state: State, phases: Bytes, k: Prepared) -> None:
             meets_part = k[c.CONTACT, i] > 0.0 and not math.isnan(k[c.RELEASE, i])
             state[OPEN, i] = state[OPEN, i] if meets_part else 0.0  # a part that is held stays
         if phase == _IDLE and before == _BLOW_OFF and not math.isnan(k[c.RELEASE, i]):
-            state[OPEN, i] = 1.0  # the part is released by the end of blow-off at the latest
+            state[OPEN, i] = JUST_OPEN  # the part is released by the end of blow-off at the latest
 
 
 @compiled
