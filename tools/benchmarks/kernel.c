@@ -39,6 +39,7 @@ enum { /* the state of twin.model.kernel */
     ROUGH, PHASE, OPEN, VALID, SIGNALS, STATE
 };
 enum { IDLE_PHASE, SUCTION_PHASE, HOLD_PHASE, BLOW_OFF_PHASE }; /* twin.signals.Phase */
+#define JUST_OPEN (1.0 + 1e-9)
 enum { PART_PRESENT_SIGNAL = 1, AIR_SAVING_SIGNAL = 2 }; /* twin.signals.Signal */
 
 INLINED double max(double a, double b) { return a > b ? a : b; }
@@ -585,7 +586,7 @@ static void enter(double *state, int phase, const double *k)
     if (phase == SUCTION_PHASE && before != HOLD_PHASE)
         S(OPEN) = K(CONTACT) > 0.0 && !isnan(K(RELEASE)) ? S(OPEN) : 0.0;
     if (phase == IDLE_PHASE && before == BLOW_OFF_PHASE && !isnan(K(RELEASE)))
-        S(OPEN) = 1.0;
+        S(OPEN) = JUST_OPEN;
 }
 
 static void settle(double *state, const double *k, double pressure)
