@@ -146,6 +146,17 @@ def test_a_slow_sensor_shows_it_later_but_not_by_more_than_its_lag(lag: float) -
     assert late.max() < lag + 2.0
 
 
+def test_a_nozzle_that_closes_slowly_is_timed_by_the_pressure_at_which_it_does() -> None:
+    def rounded(ms: Floats) -> Floats:
+        closed = np.maximum(ms - 100.0, 0.0)
+        falls_to = 200.0 + 800.0 * np.exp(-np.cumsum(np.exp(-closed / 20.0)) / 45.0)
+        return falls_to + 90.0 * (1.0 - np.exp(-closed / 40.0)) ** 2
+
+    off = times(switched(stream(rounded, noise=1.0)), on=False)
+    assert len(off) == CYCLES
+    assert np.ptp(off) <= 2.0
+
+
 def test_a_line_that_rings_is_off_at_its_first_swing_and_not_on_again() -> None:
     def rings(ms: Floats) -> Floats:
         since = np.maximum(ms - 450.0, 0.0)

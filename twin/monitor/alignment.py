@@ -2,6 +2,10 @@
 
 The valve's stroke, the line and the sensor round all breakpoints of a record in the same way. All
 of them together give that common shape; then noise only affects the time of each.
+
+A nozzle that closes slowly rounds its breakpoint so much that the slope hardly breaks. But the
+control switches at a pressure. So the courses are aligned by when they pass a pressure as well,
+and that alignment counts if it makes them much more alike.
 """
 
 from collections.abc import Sequence
@@ -14,6 +18,11 @@ from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, ver
 from twin.signals import MS
 
 FEWEST = 3  # breakpoints, for a mean course
+AROUND = 40.0 * MS  # a break on either side, where courses are compared
+CLEAR = 5.0  # sigmas of a reading
+# Share of the squares. On 39 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
+# pressure places breaks better, and 0.46 or more where the breaks place themselves.
+MUCH_MORE_ALIKE = 0.25
 ROUNDS, NARROWS = 4, 0.7
 OF_NOISE = 40.0  # variance factor of the time, as in ``breakpoints``, with the common shape known
 LEAST, LEAST_ROWS = 80.0 * MS, 12  # shortest window on either side
@@ -38,7 +47,61 @@ class Knee:
     jump: float  # Pa/s, change of the slope
     scale: float  # s, over which the course is approximately a parabola
     stepped: bool = False
+    later: bool = False  # in a suction whose nozzle went on again before
     held: float = np.nan  # Pa, at the end of suction, if the nozzle is off until then
+
+
+def align_by_level(course: Course, knees: Sequence[Knee]) -> None:
+    """Move the ``knees`` of falls to where they pass a common pressure, if that suits better.
+
+    It does where their courses are much more alike then. The first falls of suctions and later ones
+    have courses of their own, and pass the pressure by a time of their own before the knee.
+    """
+    if len(knees) < FEWEST:
+        return
+    times = np.array([knee.time for knee in knees])
+    passes = np.array([_passes(course, knee, _passed_by_all(course, knees)) for knee in knees])
+    if not (np.abs(times - passes) < AROUND).all():  # the fall is too slow to time a pressure
+        return
+    by_level = np.empty(len(knees))
+    before = after = 0.0
+    for later in {knee.later for knee in knees}:
+        alike = [number for number, knee in enumerate(knees) if knee.later == later]
+        by_level[alike] = passes[alike] + np.median((times - passes)[alike])
+        alike_knees = [knees[number] for number in alike]
+        before += _difference(course, alike_knees, times[alike])
+        after += _difference(course, alike_knees, by_level[alike])
+    if after < MUCH_MORE_ALIKE * before:
+        for knee, time in zip(knees, by_level.tolist(), strict=True):
+            knee.time = time
+
+
+def _passed_by_all(course: Course, knees: Sequence[Knee]) -> float:
+    """The pressure (Pa) of most ``knees``, or a higher one that all courses fall below."""
+    lowest = [course.pressure[slice(*knee.rows)].min() for knee in knees]
+    surely = float(max(lowest)) + CLEAR * course.noise.single
+    return max(float(np.median([knee.level for knee in knees])), surely)
+
+
+def _passes(course: Course, knee: Knee, level: float) -> float:
+    """Time (s) at which the course before or after a knee falls to ``level``; NaN if not."""
+    begin, end = knee.rows
+    below = course.pressure[begin:end] <= level
+    row = int(below.argmax())
+    if row == 0:
+        return np.nan
+    rows = [begin + row, begin + row - 1]
+    return float(np.interp(level, course.pressure[rows], course.time[rows]))
+
+
+def _difference(course: Course, knees: Sequence[Knee], times: Floats) -> float:
+    """Sum (Pa²) over rows of how far the courses about ``times`` are from the usual one."""
+    offsets = np.arange(-AROUND, AROUND, course.period)
+    ends = np.array([course.time[knee.rows[1] - 1] for knee in knees])
+    at = times[:, None] + offsets
+    values = np.where(at <= ends[:, None], np.interp(at, course.time, course.pressure), np.nan)
+    values = values[:, np.isfinite(values).any(axis=0)]
+    return float(np.nansum((values - np.nanmedian(values, axis=0)) ** 2))
 
 
 def align(course: Course, knees: Sequence[Knee]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.inference.levels import MAD_TO_SIGMA
-from twin.monitor.alignment import Knee, align
+from twin.monitor.alignment import Knee, align, align_by_level
 from twin.monitor.breakpoints import (
     Course,
     Floats,
@@ -193,6 +193,7 @@ def _all_knees(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
         levels = Levels.of(knees, len(suctions))
     for on in (False, True):
         align(course, [knee for knee in knees if knee.on == on])
+    align_by_level(course, [knee for knee in knees if not knee.on])
     return sorted(knees, key=lambda knee: knee.time)
 
 
@@ -295,7 +296,9 @@ class _Suction:
             time, level = first_swing.time, first_swing.level
             stepped_break = first_swing
         jump = placed_break.jump if placed_break and not stepped_break else jump
-        return Knee(False, time, level, (first, last), jump, scale, stepped_break is not None)
+        return Knee(
+            False, time, level, (first, last), jump, scale, stepped_break is not None, later
+        )
 
     def _is_off(self, best: "_SlopeBreak", rise: float, depth: float) -> bool:
         """Whether a break is clear enough; limits are lower at the level of the other suctions."""
