@@ -20,7 +20,7 @@ from twin.signals import MS
 FEWEST = 3  # breakpoints, for a mean course
 AROUND = 40.0 * MS  # a break on either side, where courses are compared
 CLEAR = 5.0  # sigmas of a reading
-# Share of the squares. On 39 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
+# Share of the squares. On 35 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
 # pressure places breaks better, and 0.46 or more where the breaks place themselves.
 MUCH_MORE_ALIKE = 0.25
 ROUNDS, NARROWS = 4, 0.7
