@@ -19,7 +19,7 @@ USAGE, SOURCE = 2, 3
 NEEDED = {
     "run": ("C", "--once"),
     "replay": ("L",),
-    "plc": ("C", "--duration", "0", "--port", "0"),
+    "plc": ("C", "--duration", "0.01", "--port", "0"),
     "probe": ("C",),
     "diagnose": ("L",),
     "calibrate": ("L", "--config", "C"),
@@ -112,7 +112,7 @@ WRONG = {
     "--id": (("nobody",), EITHER),
     "--days": NUMBERS,
     "--hours": NUMBERS,
-    "--duration": NUMBERS,
+    "--duration": ((*NUMBERS[0], "0"), {USAGE}),
     "--tolerance": NUMBERS,
     "--seed": (("-1", "x"), {USAGE}),
     "--as-of": (("yesterday",), {USAGE}),
@@ -172,7 +172,7 @@ def _cases() -> Iterator[tuple[str, tuple[str, ...], set[int]]]:
     yield "fleet report", (), {SOURCE}
     yield "fleet replay", ("L", "--engine", "dask"), {USAGE}
     yield "run", ("C", "--log", "nofolder/new.mcap"), {SOURCE}
-    yield "plc", ("no_rig.toml", "--duration", "0"), {USAGE}
+    yield "plc", ("no_rig.toml", "--duration", "1"), {USAGE}
 
 
 def _without(needed: tuple[str, ...], option: str) -> tuple[str, ...]:
@@ -239,8 +239,10 @@ def test_a_mistake_is_said_and_ends_as_the_contract_has_it(
         (("run", "bytes.bin"), "not a text file"),
         (("alarms", "rules", "--config", "other.toml"), "unknown table [project]"),
         (("assets", "list", "--config", "other.toml"), "unknown table [project]"),
-        (("plc", "no_rig.toml", "--duration", "0"), "there is no [plc] table"),
+        (("plc", "no_rig.toml", "--duration", "1"), "there is no [plc] table"),
         (("assets", "show", "paper-unit", "--as-of", "1999-01-01"), "at that time"),
+        (("plc", CONFIG, "--duration", "0"), "0 is not a finite number above 0"),
+        (("run", CONFIG, "--duration", "0"), "0 is not a finite number above 0"),
         (("run", CONFIG, "--once", "--id", "rig-0l"), "did you mean 'rig-01'?"),
     ],
 )

@@ -32,6 +32,14 @@ def test_it_keeps_every_scan_and_its_clock_can_be_set(tmp_path: Path) -> None:
     assert SET_NS // 2 < ahead_ns <= SET_NS
 
 
+def test_no_time_ends_it_at_once() -> None:
+    settings = rigs.config("gripper").document.section(PlcSettings, "plc").on_port(0)
+    settings = settings.model_copy(update={"opcua": None})
+    listening = list[int]()
+    run_plc(settings, duration_s=0.0, ready=lambda _, port: listening.append(port))
+    assert len(listening) == 1
+
+
 def test_it_says_where_it_listens(capsys: pytest.CaptureFixture[str]) -> None:
     announce("127.0.0.1", 502)
     assert capsys.readouterr().out == "listening on 127.0.0.1:502\n"

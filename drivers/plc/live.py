@@ -90,7 +90,7 @@ async def _run(
         ready(tasks[0].settings.server.host, port)
         if opcua:
             print(f"OPC UA on {opcua.url}", flush=True)  # noqa: T201 - as above
-        end_ns = first_ns + (duration_s or float("inf")) * 1e9
+        end_ns = first_ns + (float("inf") if duration_s is None else duration_s) * 1e9
         while not stop.is_set() and time.monotonic_ns() < end_ns:
             catch_up()
             if opcua:

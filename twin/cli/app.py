@@ -179,6 +179,13 @@ def not_negative(value: float | None) -> float | None:
     return value
 
 
+def positive(value: float | None) -> float | None:
+    """Callback of a numeric option: usage error unless the number is finite and above 0."""
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise typer.BadParameter(f"{value:g} is not a finite number above 0")
+    return value
+
+
 def audit_of(folder: Path) -> Audit:
     """The audit trail for actions of commands."""
     return Audit(folder, "command", lambda text: print(f"twin: {text}", file=sys.stderr))

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.app import not_negative, read_config
+from twin.cli.app import positive, read_config
 from twin.cli.options import Address, ConfigFile, ConfigFiles
 from twin.errors import ConfigError
 
@@ -21,7 +21,7 @@ def plc(
     ] = 0,
     duration: Annotated[
         float | None,
-        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds."),
+        typer.Option(metavar="S", callback=positive, help="Stop after S seconds."),
     ] = None,
 ) -> None:
     """Run the simulated PLC with an ejector behind it, for trials and tests.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.alarms import alarms_of, asker_of, limit_changes_of
-from twin.cli.app import not_negative
+from twin.cli.app import positive
 from twin.cli.console import Console, no_status, printers, status
 from twin.cli.figures import keeper_of
 from twin.cli.notifications import outlets_of
@@ -53,7 +53,7 @@ def run(
     *,
     duration: Annotated[
         float | None,
-        typer.Option(metavar="S", callback=not_negative, help="Stop after S seconds with the PLC."),
+        typer.Option(metavar="S", callback=positive, help="Stop after S seconds with the PLC."),
     ] = None,
     log: Annotated[
         Path | None,
