@@ -145,8 +145,31 @@ def test_twin_cert_makes_what_servers_want(
     usage = own.certificate.extensions.get_extension_for_class(x509.KeyUsage).value
     assert usage.digital_signature
     assert usage.data_encipherment
-    with pytest.raises(ConfigError, match="is there already"):
-        cert(tmp_path / "pki", "again")
+
+
+def test_twin_cert_replaces_a_certificate_with_force_alone(
+    tmp_path: Path, keys: list[Key], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pki = tmp_path / "pki"
+    cert(pki, "line 3")
+    save(pki, self_signed(keys[0])[0])
+    first = certificates.own(pki, NOW)
+    first.key.chmod(0o644)
+    with pytest.raises(SourceError, match="already a file of that name") as refused:
+        cert(pki, "line 3")
+    assert "--force" in refused.value.hint
+    assert certificates.own(pki, NOW).certificate == first.certificate
+    cert(pki, "line 3", force=True)
+    assert certificates.own(pki, NOW).certificate != first.certificate
+    assert stat.S_IMODE(first.key.stat().st_mode) == 0o600
+    assert (pki / certificates.TRUSTED / "c.der").exists()
+
+
+def test_what_is_said_of_a_certificate_that_cannot_be_used_replaces_it(tmp_path: Path) -> None:
+    cert(tmp_path / "pki")
+    with pytest.raises(ConfigError, match="expired on") as expired:
+        certificates.own(tmp_path / "pki", NOW + (certificates.DAYS + 1) * DAY)
+    assert expired.value.hint.endswith(f"twin cert {tmp_path / 'pki'} --force")
 
 
 @pytest.mark.parametrize("kind", [DER, PEM])

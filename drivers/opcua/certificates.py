@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from twin.errors import ConfigError, SourceError
+from twin.files import refuse_existing
 
 OWN, KEY = Path("own") / "certificate.der", Path("own") / "key.pem"
 TRUSTED, REVOKED, REJECTED = "trusted", "revoked", "rejected"
@@ -40,11 +41,11 @@ class Own:
         return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
 
 
-def make(folder: Path, name: str = "ejector-twin", days: int = DAYS) -> Own:
-    """Make a certificate of our own and its key; ConfigError if there is one already."""
+def make(folder: Path, name: str = "ejector-twin", days: int = DAYS, *, force: bool = False) -> Own:
+    """Make a certificate of our own and its key; SourceError if one would be replaced unforced."""
     path = folder / OWN
-    if path.exists():
-        raise ConfigError(f"{path} is there already", "delete it first if it is to be replaced")
+    for existing in (path, folder / KEY):
+        refuse_existing(existing, force=force)
     for subfolder in (path.parent, *(folder / name for name in (TRUSTED, REVOKED, REJECTED))):
         subfolder.mkdir(parents=True, exist_ok=True)
     key = rsa.generate_private_key(public_exponent=65537, key_size=KEY_BITS)
@@ -55,6 +56,7 @@ def make(folder: Path, name: str = "ejector-twin", days: int = DAYS) -> Own:
 
 
 def _write_key(path: Path, key: rsa.RSAPrivateKey) -> None:
+    path.unlink(missing_ok=True)  # it may be readable for others
     path.touch(mode=0o600)  # before it holds the key
     path.write_bytes(
         key.private_bytes(
@@ -124,14 +126,16 @@ def _alternative_names(certificate: x509.Certificate) -> x509.SubjectAlternative
 def own(folder: Path, now: datetime) -> Own:
     """Our own certificate; ConfigError if it is missing, unreadable, or out of date."""
     path, key = folder / OWN, folder / KEY
-    again = f"make one: twin cert {folder}"
+    command = f"make one: twin cert {folder}"
     if not (path.is_file() and key.is_file()):
-        raise ConfigError(f"{folder}: there is no certificate of our own", again)
+        raise ConfigError(f"{folder}: there is no certificate of our own", command)
     certificate = _read(path)
     if certificate is None:
-        raise ConfigError(f"{path} is no certificate", f"delete it and {again}")
+        raise ConfigError(f"{path} is no certificate", f"{command} --force")
     if not _in_time(certificate, now):
-        raise ConfigError(f"{path}: our own certificate {_when(certificate, now)}", again)
+        raise ConfigError(
+            f"{path}: our own certificate {_when(certificate, now)}", f"{command} --force"
+        )
     return Own(certificate, path, key)
 
 
