@@ -450,6 +450,8 @@ def test_it_is_fit_for_gloves_on_every_screen(
             page.goto(url)
             expect(page.locator("#all-rows tr")).to_have_count(6)
             _is_fit(page)
+            heads = [one.is_visible() for one in page.get_by_text("Key figures (expected)").all()]
+            assert heads == ([False, *[True] * 6] if width < 600 else [True, *[False] * 6])
             page.locator("tr[data-name=cell-01] td").nth(1).click()
             expect(page.locator("#one-alarms article")).to_have_count(1)
             _is_fit(page)

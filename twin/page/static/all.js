@@ -46,11 +46,15 @@ function line(ejector) {
     element("td", { class: "light" }, icon(ejector.light), element("b", {}, ejector.words)),
     element("th", { scope: "row" }, name, element("span", { class: "dim" }, ejector.type + batch)),
     element("td", {}, ...what(ejector)),
-    element("td", {}, ...seen(ejector)),
-    element("td", { class: "figures" }, ...ejector.figures.map(figure)),
+    element("td", {}, head(t("Last seen")), ...seen(ejector)),
+    element("td", { class: "figures" }, head(t("Key figures (expected)")), ...ejector.figures.map(figure)),
     element("td", { class: "spark" }, spark(ejector.spark)));
   row.addEventListener("click", () => { location.hash = hrefOf(ejector); });
   return row;
+}
+
+function head(text) { // of a cell where the table's own heads are not shown
+  return element("span", { class: "dim head" }, text);
 }
 
 function what(ejector) {

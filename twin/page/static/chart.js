@@ -10,7 +10,7 @@ const DATES = LANGUAGE === "en" ? "en-GB" : LANGUAGE; // the day before the mont
 const DAY_S = 86400;
 const MONDAY_S = 4 * DAY_S; // the first one after 1970 began
 const STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
-  ...[1, 2, 7, 14, 28, 56].map((days) => days * DAY_S)];
+  ...[1, 2, 3, 7, 14, 28, 56].map((days) => days * DAY_S)];
 
 // --- ticks ---------------------------------------------------------------------------------------
 
