@@ -311,6 +311,9 @@ TRACES: dict[str, ImportSettings] = {
     "trace_twincat_scope.txt": settings(
         {"vacuum_mbar": "rVacuum", "suction": "bSuction", "blow_off": "bBlowOff"}
     ),
+    "trace_twincat_scope_shared.csv": settings(
+        {"vacuum_mbar": "rVacuum", "suction": "bSuction", "blow_off": "bBlowOff"}
+    ),
     "trace_codesys.txt": settings(
         {
             "time_ms": "Cycle",
@@ -368,6 +371,31 @@ def test_scope_channels_that_are_not_sampled_together_are_refused(tmp_path: Path
     path = written(tmp_path, text.replace("\n0\t0,00\t0\t", "\n0\t0,00\t5\t"), "t.txt")
     with pytest.raises(SourceError, match="begin at 2 different times"):
         open_table(path, TRACES["trace_twincat_scope.txt"], AMBIENT)
+
+
+def test_scope_writes_the_same_begin_in_more_than_one_way(tmp_path: Path) -> None:
+    name = "trace_twincat_scope.txt"
+    text = (DATA / name).read_text(encoding="utf-8-sig")
+    path = written(tmp_path, text.replace("\n0\t0,00\t0\t", "\n0.0\t0,00\t0\t"), name)
+    assert taken(path, TRACES[name]).tobytes() == trace(name).tobytes()
+
+
+def test_scope_channels_of_other_sample_times_are_refused() -> None:
+    how = settings({"vacuum_mbar": "rValve", "suction": "bSuction", "blow_off": "bBlowOff"})
+    with pytest.raises(SourceError, match="are sampled every 10 and 5 ms"):
+        open_table(DATA / "trace_twincat_scope_shared.csv", how, AMBIENT)
+
+
+def test_a_table_whose_first_column_is_called_name_is_none_of_scope(tmp_path: Path) -> None:
+    path = written(tmp_path, "Name" + "\nrig 4".join(f",{line}" for line in SMALL.splitlines()))
+    assert taken(path).tobytes() == taken(written(tmp_path, SMALL, "u.csv")).tobytes()
+
+
+@pytest.mark.parametrize("ending", [".svdx", ".ttrecx", ".trace"])
+def test_a_file_that_only_its_program_reads_is_to_be_exported(tmp_path: Path, ending: str) -> None:
+    with pytest.raises(ConfigError, match="cannot tell what it is") as caught:
+        open_table(written(tmp_path, b"PK", f"t{ending}"), settings(), AMBIENT)
+    assert "export one in" in caught.value.hint
 
 
 # --- Excel --------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ rows. The header is the first row that has the name of a known column; rows befo
 
 import codecs
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -54,14 +54,11 @@ class CsvFile:
         if header.before:
             self.notes.append(f"the header is line {self._head}; what stands before it is not read")
         self._first = self._head + 1  # first line that may hold values
-        self._is_row = _is_row
-        if scope.is_header(self.names):
-            self._is_row = _is_row_of_scope
-            following = (
-                (line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE)
-            )
-            self._first, self.names = scope.columns(self.names, following, self.location)
-            self.notes.append("it is of TwinCAT Scope: all channels have the time of the first one")
+        self._is_row: Callable[[str], bool] = _is_row
+        self._whole: Callable[[str], str] = str
+        if self.names[0] == scope.NAME:
+            below = [(line, _cells(row, self._separator)) for line, row in islice(rows, _PREAMBLE)]
+            self._find_channels(below, known_names)
 
     @property
     def location(self) -> str:
@@ -74,7 +71,7 @@ class CsvFile:
         for first, piece in self._pieces():
             skipped = max(0, self._first - first)  # the header and what is before it
             lines = piece[skipped:]
-            rows = [line for line in lines if self._is_row(line)]
+            rows = [self._whole(line) for line in lines if self._is_row(line)]
             if rows:
                 yield self._batch(first + skipped, lines, rows, index)
 
@@ -154,6 +151,25 @@ class CsvFile:
         )
         return _with_gaps(table, broken, len(rows)) if broken else table
 
+    def _find_channels(self, below: scope.Rows, wanted: set[str]) -> None:
+        """Where values and times are, if the file is an export of TwinCAT Scope."""
+        if not scope.has_properties(below):
+            return
+        self._first, self.names, self._time = scope.values(self.names, below, wanted, self.location)
+        self._is_row, self._whole = self._is_row_of_scope, self._whole_row_of_scope
+        self.notes.append("it is of TwinCAT Scope: all channels have the same times")
+
+    def _is_row_of_scope(self, line: str) -> bool:
+        """Whether a line has values of the channels that are read; others may go on longer."""
+        if not line.strip() or line.strip() == scope.END:
+            return False
+        cells = _cells(line, self._separator)
+        return self._time < len(cells) and cells[self._time] != ""
+
+    def _whole_row_of_scope(self, line: str) -> str:
+        """A line with all its cells: those of channels that have ended may be left out."""
+        return line + self._separator * (len(self.names) - 1 - line.count(self._separator))
+
     def _pieces(self) -> Iterator[tuple[int, list[str]]]:
         """The lines of the file in pieces, each with the number of its first line."""
         first = 1
@@ -161,10 +177,6 @@ class CsvFile:
             for piece in _whole_lines(self._path, self._encoding):
                 yield first, (lines := _cut(piece))
                 first += len(lines)
-
-
-def _is_row_of_scope(line: str) -> bool:
-    return _is_row(line) and line.strip() != scope.END
 
 
 class _Header(NamedTuple):

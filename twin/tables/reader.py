@@ -141,6 +141,12 @@ _KINDS: dict[str, type[_File]] = {
     ".parquet": ParquetFile,
 }
 
+_OTHER_FORMATS = {  # of PLC tools, and how they export a table
+    ".svdx": "in TwinCAT Scope: Export to csv",
+    ".ttrecx": "in TIA Portal: Export measurement, as *.csv",
+    ".trace": "in CODESYS: Save Trace, as *.txt",
+}
+
 
 def open_table(
     path: Path, settings: ImportSettings, ambient: float, *, derive: bool = False
@@ -155,7 +161,11 @@ def open_table(
         raise SourceError(f"{path}: cannot be read: No such file or directory", "check the path")
     if kind is None:
         suffixes = ", ".join(_KINDS)
-        raise ConfigError(f"{path}: cannot tell what it is", f"{suffixes} files can be read")
+        export = _OTHER_FORMATS.get(path.suffix.lower())
+        hint = f"{suffixes} files can be read"
+        raise ConfigError(
+            f"{path}: cannot tell what it is", f"{hint}; export one {export}" if export else hint
+        )
     file = kind(path, settings)
     layout = find_layout(file.names, settings, file.location, derive=derive)
     return Table(path, layout, settings, ambient, file)
