@@ -1,5 +1,6 @@
 """Tables as people have them: dates, units, signs, encodings, sheets, and what PLC tools export."""
 
+import tomllib
 import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -23,9 +24,10 @@ from twin.log.reader import open_log
 from twin.signals import PASCAL, Command, Samples, joined
 from twin.tables import reader
 from twin.tables.excel_file import ExcelFile
+from twin.tables.likely import likely_columns
 from twin.tables.preview import FIRST, HEIGHT, WIDTH, Preview
 from twin.tables.reader import open_table
-from twin.tables.settings import ImportSettings
+from twin.tables.settings import Column, ImportSettings
 
 DATA = Path(__file__).parent / "data"
 BEGIN = datetime(2026, 3, 1, 12, tzinfo=ZoneInfo("Europe/Berlin"))
@@ -391,11 +393,48 @@ def test_a_table_whose_first_column_is_called_name_is_none_of_scope(tmp_path: Pa
     assert taken(path).tobytes() == taken(written(tmp_path, SMALL, "u.csv")).tobytes()
 
 
-@pytest.mark.parametrize("ending", [".svdx", ".ttrecx", ".trace"])
-def test_a_file_that_only_its_program_reads_is_to_be_exported(tmp_path: Path, ending: str) -> None:
+@pytest.mark.parametrize(
+    ("ending", "advice"),
+    [
+        (".svdx", "export one in TwinCAT Scope"),
+        (".ttrecx", "export one in TIA Portal"),
+        (".trace", "export one in CODESYS"),
+        (".xls", "save it as"),
+        (".mcap", "a log needs no import"),
+    ],
+)
+def test_of_a_file_that_is_no_table_it_is_said_what_to_do(
+    tmp_path: Path, ending: str, advice: str
+) -> None:
     with pytest.raises(ConfigError, match="cannot tell what it is") as caught:
         open_table(written(tmp_path, b"PK", f"t{ending}"), settings(), AMBIENT)
-    assert "export one in" in caught.value.hint
+    assert advice in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["trace_s7.csv", "trace_codesys.txt"])
+def test_what_a_header_may_mean_is_proposed_and_can_be_pasted(name: str) -> None:
+    with pytest.raises(SourceError, match="no column time_s") as caught:
+        open_table(DATA / name, settings(), AMBIENT)
+    proposed = tomllib.loads(caught.value.hint.partition("[import.columns]\n  ")[2])
+    time = {"time_ms"} if name == "trace_s7.csv" else set()  # a count of cycles has no unit
+    assert proposed.keys() == {"vacuum", "suction", "blow_off"} | time
+    written_by_hand = {source.name for source in TRACES[name].columns.values()}
+    assert set(proposed.values()) <= written_by_hand
+
+
+def test_what_is_mapped_already_is_not_proposed_again(tmp_path: Path) -> None:
+    path = written(tmp_path, "Zeit [ms];Saugventil;Abblasventil;Druck [bar]\n0;0;0;1\n")
+    how = settings({"time_ms": "Zeit [ms]", "suction": "Saugventil"})
+    with pytest.raises(SourceError, match="no column pressure_mbar") as caught:
+        open_table(path, how, AMBIENT)
+    assert '  blow_off = "Abblasventil"\n  pressure = "Druck [bar]"' in caught.value.hint
+    assert "Saugventil" not in caught.value.hint
+
+
+def test_of_several_times_one_is_proposed() -> None:
+    header = ["Datum", "Zeit [ms]", "Zeit [s]", "Zeit", "p"]
+    assert likely_columns(header) == {Column.TIME_S: "Zeit [s]"}
+    assert likely_columns(["Zeit", "x"]) == {}
 
 
 # --- Excel --------------------------------------------------------------------------------------

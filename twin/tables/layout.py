@@ -6,6 +6,7 @@ from difflib import get_close_matches
 
 from twin.errors import ConfigError, SourceError
 from twin.signals import MBAR, SL_MIN, ZERO_C, Command, Reported
+from twin.tables.likely import as_toml, likely_columns
 from twin.tables.meaning import PRESSURES, SUPPLIES, Meaning, find_meaning
 from twin.tables.settings import Column, ColumnSource, ImportSettings
 
@@ -138,7 +139,11 @@ def _require_one(
 ) -> None:
     present = [file_names[name] for name in names if name in file_names]
     if not present:
-        raise _missing(f"no column {' or '.join(names)}", names[0], header, location)
+        error = _missing(f"no column {' or '.join(names)}", names[0], header, location)
+        likely = likely_columns(header, file_names.values())
+        if likely:
+            error.hint += f"; by their names these may be:\n  [import.columns]\n{as_toml(likely)}"
+        raise error
     if len(present) > 1:
         raise _too_many(
             f"only one of the columns {', '.join(map(repr, present))} can be used", location

@@ -141,10 +141,12 @@ _KINDS: dict[str, type[_File]] = {
     ".parquet": ParquetFile,
 }
 
-_OTHER_FORMATS = {  # of PLC tools, and how they export a table
-    ".svdx": "in TwinCAT Scope: Export to csv",
-    ".ttrecx": "in TIA Portal: Export measurement, as *.csv",
-    ".trace": "in CODESYS: Save Trace, as *.txt",
+_OTHER_FORMATS = {  # what to do with them
+    ".svdx": "export one in TwinCAT Scope: Export to csv",
+    ".ttrecx": "export one in TIA Portal: Export measurement, as *.csv",
+    ".trace": "export one in CODESYS: Save Trace, as *.txt",
+    ".xls": "save it as *.xlsx",
+    ".mcap": "a log needs no import, as in: twin diagnose LOG.mcap",
 }
 
 
@@ -161,11 +163,9 @@ def open_table(
         raise SourceError(f"{path}: cannot be read: No such file or directory", "check the path")
     if kind is None:
         suffixes = ", ".join(_KINDS)
-        export = _OTHER_FORMATS.get(path.suffix.lower())
-        hint = f"{suffixes} files can be read"
-        raise ConfigError(
-            f"{path}: cannot tell what it is", f"{hint}; export one {export}" if export else hint
-        )
+        advice = _OTHER_FORMATS.get(path.suffix.lower())
+        hint = f"{suffixes} files can be read" + (f"; {advice}" if advice else "")
+        raise ConfigError(f"{path}: cannot tell what it is", hint)
     file = kind(path, settings)
     layout = find_layout(file.names, settings, file.location, derive=derive)
     return Table(path, layout, settings, ambient, file)

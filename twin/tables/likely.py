@@ -1,0 +1,60 @@
+"""Columns that a file's header may mean, by words of the field in English and German."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+
+from twin.tables.settings import Column
+
+_TIME_UNITS = {
+    "s": Column.TIME_S,
+    "ms": Column.TIME_MS,
+    "us": Column.TIME_US,
+    "µs": Column.TIME_US,
+    "ns": Column.TIME_NS,
+}
+_TIME_UNIT = re.compile(r"[\[(]\s*(s|ms|us|µs|ns)\s*[\])]\s*$")
+_TIME = re.compile(r"time|zeit", re.IGNORECASE)
+_INSTANT = re.compile(r"timestamp|date|datum|uhrzeit", re.IGNORECASE)
+_WORDS = {  # in order: a word of suction may stand in the name of a vacuum's block
+    Column.BLOW_OFF: re.compile(r"blow|abblas|ausblas|abwurf|abwerf", re.IGNORECASE),
+    Column.VACUUM: re.compile(r"vacuum|vakuum|unterdruck", re.IGNORECASE),
+    Column.SUCTION: re.compile(r"suction|suck|saug", re.IGNORECASE),
+    Column.PRESSURE: re.compile(r"press|druck", re.IGNORECASE),
+}
+
+
+def likely_columns(header: Sequence[str], taken: Collection[str] = ()) -> Mapping[Column, str]:
+    """For each known column the first name of the header that may mean it; ``taken`` are none.
+
+    Only one of vacuum and pressure is given, and no time whose unit the name does not have.
+    """
+    likely: dict[Column, str] = {}
+    for name in header:
+        column = None if name in taken else _likely(name)
+        if column is not None:
+            likely.setdefault(column, name)
+    if Column.VACUUM in likely:
+        likely.pop(Column.PRESSURE, None)
+    times = [column for column in (*_TIME_UNITS.values(), Column.TIME) if column in likely]
+    for column in dict.fromkeys(times[1:]):
+        if column != times[0]:
+            likely.pop(column, None)
+    return likely
+
+
+def _likely(name: str) -> Column | None:
+    unit = _TIME_UNIT.search(name)
+    if _TIME.search(name) and unit is not None:
+        return _TIME_UNITS[unit[1]]
+    if _INSTANT.search(name):
+        return Column.TIME
+    return next((column for column, words in _WORDS.items() if words.search(name)), None)
+
+
+def as_toml(columns: Mapping[Column, str]) -> str:
+    """Lines of ``[import.columns]``; the names stand as TOML wants them."""
+    return "\n".join(f"  {column} = {_quoted(name)}" for column, name in columns.items())
+
+
+def _quoted(name: str) -> str:
+    return f'"{name}"' if '"' not in name and "\\" not in name else f"'{name}'"
