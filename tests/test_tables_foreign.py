@@ -27,7 +27,7 @@ from twin.tables.excel_file import ExcelFile
 from twin.tables.likely import likely_columns
 from twin.tables.preview import FIRST, HEIGHT, WIDTH, Preview
 from twin.tables.reader import open_table
-from twin.tables.settings import Column, ImportSettings
+from twin.tables.settings import Column, ImportSettings, toml_string
 
 DATA = Path(__file__).parent / "data"
 BEGIN = datetime(2026, 3, 1, 12, tzinfo=ZoneInfo("Europe/Berlin"))
@@ -420,6 +420,20 @@ def test_what_a_header_may_mean_is_proposed_and_can_be_pasted(name: str) -> None
     assert proposed.keys() == {"vacuum", "suction", "blow_off"} | time
     written_by_hand = {source.name for source in TRACES[name].columns.values()}
     assert set(proposed.values()) <= written_by_hand
+
+
+def test_a_line_that_is_proposed_is_toml_whatever_the_name(tmp_path: Path) -> None:
+    for name in ('"DB".p', "it's", "\"a\" and 'b'", "a\\b"):
+        assert tomllib.loads(f"x = {toml_string(name)}") == {"x": name}
+    how = TRACES["trace_s7.csv"]
+    vacuum = settings({**{key: source.name for key, source in how.columns.items()}})
+    columns = {**vacuum.columns, Column.VACUUM: vacuum.columns[Column.PRESSURE]}
+    del columns[Column.PRESSURE]
+    with pytest.raises(SourceError, match="In which unit is it") as caught:
+        taken(DATA / "trace_s7.csv", vacuum.model_copy(update={"columns": columns}))
+    line = caught.value.hint.splitlines()[1].partition("#")[0]
+    read = tomllib.loads(line)["pressure"]
+    assert read == {"name": how.columns[Column.PRESSURE].name, "unit": "mbar", "reference": "gauge"}
 
 
 def test_what_is_mapped_already_is_not_proposed_again(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def _refuse_scaled(
             attributes = "unit and reference" if name in BESIDE else "unit, reference and scale"
             raise ConfigError(
                 f"{location}: {name} cannot have {attributes}",
-                f'write under [import.columns]: {name} = "{source.name}"',
+                f"write under [import.columns]: {name} = {source.quoted}",
             )
 
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 
-from twin.tables.settings import Column
+from twin.tables.settings import Column, toml_string
 
 _TIME_UNITS = {
     "s": Column.TIME_S,
@@ -53,8 +53,4 @@ def _likely(name: str) -> Column | None:
 
 def as_toml(columns: Mapping[Column, str]) -> str:
     """Lines of ``[import.columns]``; the names stand as TOML wants them."""
-    return "\n".join(f"  {column} = {_quoted(name)}" for column, name in columns.items())
-
-
-def _quoted(name: str) -> str:
-    return f'"{name}"' if '"' not in name and "\\" not in name else f"'{name}'"
+    return "\n".join(f"  {column} = {toml_string(name)}" for column, name in columns.items())

@@ -81,7 +81,7 @@ def find_meaning(
     named, reference = {**PRESSURES, **SUPPLIES}[column]
     if source.reference is not None:
         if reference == "vacuum" and source.reference != "vacuum":
-            kind = f'pressure = {{ name = "{source.name}", reference = "{source.reference}", ... }}'
+            kind = f'pressure = {{ name = {source.quoted}, reference = "{source.reference}", ... }}'
             raise ConfigError(
                 f"{location}: {column} counts from ambient, positive below", f"use {kind}"
             )
@@ -99,7 +99,7 @@ def find_meaning(
         raise SourceError(
             f"{location}: in which unit is column {source.name!r}?",
             f"say it under [import.columns]: {_generic(column)} ="
-            f' {{ name = "{source.name}", unit = "mbar" }}; units are {", ".join(get_args(Unit))}',
+            f' {{ name = {source.quoted}, unit = "mbar" }}; units are {", ".join(get_args(Unit))}',
         )
     if (
         source.is_name_only
@@ -111,8 +111,8 @@ def find_meaning(
             f"{location}: column {source.name!r} is taken as {column}, and its name says"
             f" {_UNITS[header]}: in which unit is it?",
             f"if its name is right, say under [import.columns]: {_generic(column)} ="
-            f' {{ name = "{source.name}", unit = "{_UNITS[header]}" }}; if not: {column} ='
-            f' {{ name = "{source.name}", unit = "{unit}" }}',
+            f' {{ name = {source.quoted}, unit = "{_UNITS[header]}" }}; if not: {column} ='
+            f' {{ name = {source.quoted}, unit = "{unit}" }}',
         )
     return Meaning(unit, reference, *source.line)
 
@@ -129,9 +129,9 @@ def _generic(column: Column) -> str:
 
 def _other_unit(column: Column, source: ColumnSource, stated: Unit, location: str) -> ConfigError:
     column_name = f"{_generic(column)}_{stated.lower()}"
-    line = f'{column_name} = "{source.name}"'
+    line = f"{column_name} = {source.quoted}"
     if column_name not in tuple(Column):
-        line = f'{_generic(column)} = {{ name = "{source.name}", unit = "{stated}" }}'
+        line = f'{_generic(column)} = {{ name = {source.quoted}, unit = "{stated}" }}'
     key = "unit" if source.unit else "pressure_unit"
     return ConfigError(
         f'{location}: {key} = "{stated}" under [import], but column {source.name!r} is'
@@ -145,6 +145,6 @@ def _electrical(source: ColumnSource, location: str) -> SourceError:
     return SourceError(
         f"{location}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
         "say it under [import.columns] instead, for example: pressure ="
-        f' {{ name = "{source.name}", signal = {usual}, range = [0, -1000], unit = "mbar",'
+        f' {{ name = {source.quoted}, signal = {usual}, range = [0, -1000], unit = "mbar",'
         ' reference = "gauge" }',
     )

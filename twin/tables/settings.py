@@ -1,5 +1,6 @@
 """Names of a table's columns, and settings of its import."""
 
+import json
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
@@ -9,6 +10,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from twin.settings import Settings
 from twin.signals import Reference, Unit
+
+
+def toml_string(text: str) -> str:
+    """A text as TOML wants it, without escapes where that is possible."""
+    if '"' in text and "'" not in text:
+        return f"'{text}'"
+    return json.dumps(text, ensure_ascii=False)
 
 
 class Column(StrEnum):
@@ -85,6 +93,11 @@ class ColumnSource(Settings):
             return self.scale, self.offset
         slope = (self.range[1] - self.range[0]) / (self.signal[1] - self.signal[0])
         return slope, self.range[0] - slope * self.signal[0]
+
+    @property
+    def quoted(self) -> str:
+        """The name as it stands in a configuration."""
+        return toml_string(self.name)
 
     @property
     def is_name_only(self) -> bool:

@@ -14,7 +14,7 @@ from twin.errors import SourceError
 from twin.signals import MBAR, PASCAL, UNUSABLE, Command, Reference, Samples, Unit, counted_from
 from twin.tables.layout import Layout
 from twin.tables.meaning import Meaning
-from twin.tables.settings import Column, ImportSettings
+from twin.tables.settings import Column, ImportSettings, toml_string
 
 # Ambient is about 1 bar: read as mbar, no absolute pressure or vacuum in bar comes to 2 mbar.
 # No ejector evacuates to as little, and only a dead one leaves as little after a second of suction.
@@ -129,7 +129,9 @@ def _lines(name: str, low: float, high: float, ambient: float, assumed: Meaning)
 
 def _any_line(name: str) -> list[str]:
     units = ", ".join(get_args(Unit))
-    return [f'pressure = {{ name = "{name}", unit = "...", reference = "..." }}, of {units}']
+    return [
+        f'pressure = {{ name = {toml_string(name)}, unit = "...", reference = "..." }}, of {units}'
+    ]
 
 
 def _line(name: str, unit: Unit, reference: Reference) -> str:
@@ -142,5 +144,7 @@ def _line(name: str, unit: Unit, reference: Reference) -> str:
         ("Pa", "absolute"): Column.PRESSURE_PA,
     }.get((unit, reference))
     if column is not None:
-        return f'{column} = "{name}"'
-    return f'pressure = {{ name = "{name}", unit = "{unit}", reference = "{reference}" }}'
+        return f"{column} = {toml_string(name)}"
+    return (
+        f'pressure = {{ name = {toml_string(name)}, unit = "{unit}", reference = "{reference}" }}'
+    )
