@@ -8,10 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import rigs
 from command_line import twin
+from terminal import Program
 from typer.main import get_command
 
-from twin.cli.main import ORDER, app
+from twin.cli.main import BEGIN, INSTEAD, ORDER, app
+from twin.cli.run import _hinted
 
 
 def _commands() -> Iterator[tuple[str, ...]]:
@@ -42,9 +45,47 @@ def test_the_help_begins_with_what_a_day_begins_with(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert twin(monkeypatch, "-h") == 0
-    lines = capsys.readouterr().out.partition("Commands:")[2].splitlines()
+    commands, _, begin = capsys.readouterr().out.partition("Commands:")[2].rpartition("\n\n")
+    lines = commands.splitlines()
     shown = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
     assert shown == list(ORDER)
+    assert begin.strip() == BEGIN
+
+
+@pytest.mark.parametrize("name", INSTEAD)
+def test_who_types_a_command_that_is_not_there_reads_which_is(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, name, "a.mcap") == 2
+    assert f"There is: {INSTEAD[name]}" in " ".join(capsys.readouterr().err.split())
+    assert name not in ORDER
+    for line in INSTEAD[name].split(", "):
+        _, *command = (word for word in line.split() if word.isalpha() and word.islower())
+        assert tuple(command) in COMMANDS
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_hints_are_for_people_at_a_terminal_alone(
+    terminal: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    told, log = list[str](), tmp_path / "today.mcap"
+    with _hinted(log, told.append, hil=False) as file:
+        assert file == log
+        assert told == ([f"log: {log}; Ctrl-C ends the run"] if terminal else [])
+    following = f"twin diagnose {log} --report {tmp_path / 'today.html'}"
+    assert told[1:] == ([f"{log} is written; next: {following}"] if terminal else [])
+    with _hinted(log, None, hil=False), _hinted(None, told.append, hil=True):
+        pass
+    assert told[2:] == (["Ctrl-C ends the run"] if terminal else [])
+
+
+def test_a_simulated_plc_says_what_to_run_beside_it(tmp_path: Path) -> None:
+    with Program(tmp_path, "plc", rigs.path_of("gripper"), "--port", "0") as plc:
+        plc.until(r"listening on 127\.0\.0\.1:\d+")
+        plc.until(r"twin: Ctrl-C ends it; beside it, in a second terminal: twin run \S+gripper")
+        plc.interrupt()
+        assert plc.end() == 0
 
 
 def test_the_shell_completes_commands() -> None:

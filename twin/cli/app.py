@@ -4,7 +4,7 @@ import getpass
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -80,6 +80,12 @@ class _Command(_Common, TyperCommand):
 
 class _Group(_Common, TyperGroup):
     order: Sequence[str] = ()  # of its commands in the help; empty: as they were added
+    instead: Mapping[str, str] = {}  # what is there for commands that people look for
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] in self.instead:
+            ctx.fail(f"No such command '{args[0]}'. There is: {self.instead[args[0]]}")
+        return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -90,7 +96,8 @@ class App(typer.Typer):
     """Commands whose help is plain text: Rich's markup would drop ``[table]`` from it.
 
     ``order`` names all commands; with it the shell can complete them. With ``alone`` it does
-    something without a command too.
+    something without a command too. ``instead`` has what to type for commands that people look for
+    in vain.
     """
 
     def __init__(
@@ -99,10 +106,13 @@ class App(typer.Typer):
         order: Sequence[str] = (),
         *,
         alone: bool = False,
+        epilog: str | None = None,
+        instead: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(
-            cls=type("_Ordered", (_Group,), {"order": order}),
+            cls=type("_Ordered", (_Group,), {"order": order, "instead": instead or {}}),
             help=help,
+            epilog=epilog,
             no_args_is_help=not alone,
             add_completion=bool(order),
             rich_markup_mode=None,

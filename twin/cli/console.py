@@ -96,6 +96,12 @@ def complain(text: str) -> None:
         _mute(sys.stderr)
 
 
+def hint(say: Callable[[str], None], text: str) -> None:
+    """Tell a person at a terminal what to do next; a program that reads stderr gets nothing."""
+    if sys.stderr.isatty():
+        say(text)
+
+
 def _mute(stream: TextIO) -> None:
     """Send further output of a stream without a reader to nowhere: each write would fail."""
     nowhere = os.open(os.devnull, os.O_WRONLY)

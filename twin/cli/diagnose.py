@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import say_if_cut, say_if_new
-from twin.cli.console import status
+from twin.cli.console import complain, hint, status
 from twin.cli.options import (
     JSON,
     PAGE,
@@ -101,6 +101,7 @@ def diagnose(
         from twin.diagnosis.report import write_report  # with Matplotlib
 
         write_report(diagnosis, report, report_language)
+        hint(complain, f"{report} is written; a browser shows it")
     if save_as:
         _save(diagnosis, settings, save_as, assets, log)
     if propose is not None:

@@ -44,7 +44,16 @@ ORDER = (
     *("export", "export-fmu", "effects", "paper", "plc"),
 )
 
-app = App("A live digital twin of pneumatic vacuum ejectors.", ORDER)
+INSTEAD = {  # of commands that people look for
+    "check": "twin config check FILE, twin log check LOG.mcap",
+    "report": "twin diagnose LOG.mcap --report FILE.html",
+    "show": "twin figures show LOG.mcap",
+    "simulate": "twin plc CONFIG",
+    "start": "twin run CONFIG",
+}
+BEGIN = "Without a machine begin with: twin init rig.toml --starter test_rig"
+
+app = App("A live digital twin of pneumatic vacuum ejectors.", ORDER, epilog=BEGIN, instead=INSTEAD)
 for name, sub_app in {
     "assets": assets_app,
     "figures": figures_app,

@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from twin.cli.app import positive, read_config
+from twin.cli.console import complain, hint
 from twin.cli.options import Address, ConfigFile, ConfigFiles
 from twin.errors import ConfigError
 
@@ -30,7 +31,7 @@ def plc(
     of nodes; the first one says where it listens and has the faults.
     """
     from drivers.plc.faults import parse_fault
-    from drivers.plc.live import run_plc
+    from drivers.plc.live import announce, run_plc
     from drivers.plc.settings import PlcSettings
 
     documents = [read_config(path) for path in configs]
@@ -41,7 +42,13 @@ def plc(
                 "say what is simulated, as in: twin init FILE.toml --starter test_rig",
             )
     settings = [document.section(PlcSettings, "plc").on_port(port) for document in documents]
-    run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration)
+
+    def ready(host: str, port: int) -> None:
+        announce(host, port)
+        beside = " ".join(map(str, configs))
+        hint(complain, f"Ctrl-C ends it; beside it, in a second terminal: twin run {beside}")
+
+    run_plc(settings, [parse_fault(text) for text in fault or []], seed, duration, ready)
 
 
 def probe(config: ConfigFile, address: Address = "") -> None:

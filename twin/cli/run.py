@@ -14,10 +14,19 @@ import typer
 
 from twin.cli.alarms import alarms_of, asker_of, limit_changes_of
 from twin.cli.app import positive
-from twin.cli.console import Console, no_status, printers, status
+from twin.cli.console import Console, hint, no_status, printers, status
 from twin.cli.figures import keeper_of
 from twin.cli.notifications import outlets_of
-from twin.cli.options import Address, AssetsUrl, ConfigFiles, FailOnAlarm, RrdFile, UnitId, ViewFlag
+from twin.cli.options import (
+    PAGE,
+    Address,
+    AssetsUrl,
+    ConfigFiles,
+    FailOnAlarm,
+    RrdFile,
+    UnitId,
+    ViewFlag,
+)
 from twin.cli.serve import live_rows_of, reports_of
 from twin.cli.setup import configured
 from twin.cli.sinks import open_sinks, views_of
@@ -113,7 +122,9 @@ def run(
                 return
             # A mistake in [hil] is reported before a log begins, too.
             writer = closing.enter_context(open_writer(*source_arguments)) if hil else None
-            file = _file_of(log, label, name)
+            file = closing.enter_context(
+                _hinted(_file_of(log, label, name), complain if alone else None, hil=hil)
+            )
             # It begins with the newest row: rows that came during the start are not evaluated.
             source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             rows = closing.enter_context(
@@ -261,6 +272,19 @@ def _file_of(path: Path | None, label: str, name: str) -> Path | None:
     if path is not None and path.is_dir():
         return path / time.strftime(f"{name}.%Y%m%dT%H%M%SZ.mcap", time.gmtime())
     return path.with_name(f"{path.stem}.{label}{path.suffix}") if path and label else path
+
+
+@contextmanager
+def _hinted(
+    log: Path | None, say: Callable[[str], None] | None, *, hil: bool
+) -> Iterator[Path | None]:
+    """The log; a person at a terminal is told how the run ends, and what to do with it then."""
+    if say is not None:
+        hint(say, f"{f'log: {log}; ' if log else ''}Ctrl-C ends the run")
+    yield log
+    if say is not None and log is not None and not hil:
+        page = log.with_suffix(PAGE)
+        hint(say, f"{log} is written; next: twin diagnose {log} --report {page}")
 
 
 @contextmanager
