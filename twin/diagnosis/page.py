@@ -60,6 +60,15 @@ td:nth-child(2) { min-width: 7rem; }
   dl, article dl { grid-template-columns: fit-content(9rem) 1fr; gap: .2rem .8rem; }
   tbody th { white-space: normal; }
   table { font-size: .88rem; }
+  .many, .many :is(caption, tbody, tr, th, td) { display: block; }
+  .many { width: 100%; margin-bottom: .8rem; }
+  .many thead { display: none; }
+  .many tr { border-bottom: 1px solid #888; padding: .4rem 0; }
+  .many :is(td, tbody th) { border: 0; padding: .1rem 0; max-width: none; text-align: left; }
+  .many tbody th { font-weight: 600; }
+  .many td[data-head] { display: grid; grid-template-columns: 9rem 1fr; gap: .8rem; }
+  .many td[data-head]::before { content: attr(data-head); color: #444; }
+  .many td:empty { display: none; }
 }
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }
@@ -85,6 +94,7 @@ $footer
 </html>
 """)
 
+MANY = 5  # columns: from here on a phone shows each row as a list of head and value
 SHARP = 130  # dots per inch of a picture in a summary, which is shown at about half its size
 
 # What a notebook shows of an object. Its style is below one class, so that no page loses its own.
@@ -172,23 +182,30 @@ def pairs(rows: Iterable[tuple[str, str]]) -> str:
 def table(
     caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Iterable[int] = ()
 ) -> str:
-    """Return a table; the columns ``numbers`` are right-aligned."""
+    """Return a table; the columns ``numbers`` are right-aligned.
+
+    On a phone the rows of ``MANY`` columns become lists.
+    """
     right = set(numbers)
     style = [' class="number"' if i in right else "" for i in range(len(head))]
     top = "".join(  # the corner above the rows' heads, which has no text, is no heading
         f'<th scope="col"{s}>{html.escape(h)}</th>' if h else f"<td{s}></td>"
         for h, s in zip(head, style, strict=True)
     )
-    body = "".join(f"<tr>{_row(row, style)}</tr>\n" for row in rows)
+    heads = [f' data-head="{html.escape(h)}"' if h else "" for h in head]
+    attributes = [s + h for s, h in zip(style, heads, strict=True)]
+    body = "".join(f"<tr>{_row(row, attributes)}</tr>\n" for row in rows)
+    many = ' class="many"' if len(head) >= MANY else ""
     top_line = f"<caption>{html.escape(caption)}</caption>\n" if caption else ""
     return (
-        f'<div class="wide" tabindex="0"><table>{top_line}'
+        f'<div class="wide" tabindex="0"><table{many}>{top_line}'
         f"<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
     )
 
 
-def _row(cells: Sequence[str], style: Sequence[str]) -> str:
+def _row(cells: Sequence[str], attributes: Sequence[str]) -> str:
     first, *rest = map(html.escape, cells)
     first = re.sub(r"(?<=\w[._])(?=\w)", "<wbr>", first)  # where a long key may be broken
-    data_cells = "".join(f"<td{s}>{cell}</td>" for cell, s in zip(rest, style[1:], strict=True))
+    described = zip(rest, attributes[1:], strict=True)
+    data_cells = "".join(f"<td{attribute}>{cell}</td>" for cell, attribute in described)
     return f'<th scope="row">{first}</th>{data_cells}'
