@@ -6,7 +6,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help demo test peers check format docs bench battery soak fuzz audit coverage clean
+.PHONY: help demo test peers check quick hooks format docs bench battery soak fuzz audit coverage clean
 
 help:  ## say what there is (this)
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -21,13 +21,18 @@ test: .venv/dev  ## the whole test suite
 peers:  ## a broker, a browser and PLCs of other make for the tests
 	$(PYTHON) tests/needs.py
 
-check: .venv/dev  ## what CI runs: format, lint, types, import contracts, tests
+check: quick  ## what CI runs: format, lint, types, import contracts, tests
+	$(PYTEST)
+
+quick: .venv/dev  ## the same without the tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
-	$(PYTEST)
+
+hooks:  ## let git run make quick before each commit
+	git config core.hooksPath tools/hooks
 
 format: .venv/dev  ## format the code
 	$(BIN)/ruff format .

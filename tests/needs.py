@@ -83,6 +83,7 @@ NEEDS: Mapping[str, Need] = {
         probe=("pkg-config", "--exists", "libmodbus"),
     ),
     "stunnel": Need(("stunnel",), ("stunnel4",), "Modbus inside TLS", aliases=("stunnel4",)),
+    "git": Need(("git",), ("git",), "the contributor's first change"),
     "chromium": Need(("chromium",), ("chromium",), "the technician's page and the documentation"),
 }
 INSTALL = "env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends"

@@ -74,12 +74,14 @@ def leaking(rig: str) -> Theta:
     return theta
 
 
-def test_the_table_is_the_one_promised() -> None:
+def test_the_table_has_every_effect_that_was_promised() -> None:
+    """More may be added."""
     lines = [
         f"{name}: " + ", ".join(f"{p.name} ({p.unit})" for p in effect.parameters)
         for name, effect in EFFECTS.items()
     ]
-    assert lines == CONTRACT.strip().splitlines()
+    promised = CONTRACT.strip().splitlines()
+    assert [line for line in lines if line in promised] == promised
 
 
 @every_effect

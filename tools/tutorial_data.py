@@ -1,8 +1,9 @@
 """Write the trace exports for the tutorial: one of a healthy unit, one with something wrong in it.
 
-    python tools/tutorial_data.py [FOLDER] [--seed SEED]
+    python tools/tutorial_data.py [FOLDER] [--seed SEED] [--fault FAULT]
 
-Unit, effect, size and onset are drawn by seed. What was hidden is said only with --tell.
+Unit, effect, size and onset are drawn by seed. What was hidden is said only with --tell. With
+--fault the unit is the shipped one, and only its export with that fault is written.
 """
 
 import argparse
@@ -71,8 +72,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=Path())
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--tell", action="store_true", help="say what is hidden")
+    parser.add_argument("--fault", help="a fault of the shipped unit, such as leakage=2")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
+    if arguments.fault:
+        faults = [parse_fault(arguments.fault)]
+        plc = rig_of(shipped("test_rig"))
+        write_csv(arguments.folder / "today.csv", recorded(plc, CYCLES, arguments.seed, faults))
+        print(f"today.csv is in {arguments.folder.resolve()}")
+        return
     hidden = write_data(arguments.folder, arguments.seed)
     print(f"healthy.csv and today.csv are in {arguments.folder.resolve()}")
     if arguments.tell:
