@@ -7,8 +7,8 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
 from twin.alarms.text import action_of
 from twin.instants import instant
-from twin.language import speaking
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import speaking
 from twin.page.ejector_status import (
     S_NS,
     Light,

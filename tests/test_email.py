@@ -19,11 +19,11 @@ from test_notifications import NO_TICKS, wait_until
 from twin.alarms.database import open_store
 from twin.alarms.loop import News
 from twin.alarms.settings import board_rules
-from twin.catalogues import Catalogues
 from twin.cli.notifications import outlets_of
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.language import ENGLISH
+from twin.languages.catalogues import Catalogues
+from twin.languages.texts import ENGLISH
 from twin.notifications import email, sender
 from twin.notifications.dispatch import Outlets
 from twin.notifications.email import EMAIL, MAIL

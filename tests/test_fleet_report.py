@@ -17,7 +17,7 @@ from twin.fleet.report import Refused, Report, State, report
 from twin.fleet.results_database import Key, Result
 from twin.fleet.text import headline, in_words, write_page
 from twin.fleet.type_statistics import estimates
-from twin.languages import language_of
+from twin.languages.choice import language_of
 
 EFFECTS = {"leakage": "sl/min", "suction_loss": "%", "sensor_offset": "mbar"}
 STEP = 0.1  # of size, in a sigma

@@ -20,8 +20,8 @@ from twin.config import Config
 from twin.errors import ConfigError
 from twin.events import Kind
 from twin.figures.cycle import KeyFigures
-from twin.language import speaking
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import speaking
 from twin.live import run
 from twin.monitor.isolation import Isolation
 from twin.monitor.monitor import Monitor

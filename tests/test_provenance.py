@@ -155,7 +155,7 @@ NEEDS_EXTRA = {
     "twin/fleet/text.py": "fleet",
     "twin/paper/picture.py": "reports",
     "twin/tables/": "tables",
-    "twin/catalogues.py": "serve",
+    "twin/languages/catalogues.py": "serve",
     "twin/page/": "serve",
     "twin/view.py": "view",
 }

@@ -48,8 +48,8 @@ from twin.diagnosis.report import in_words, write_report
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError
-from twin.language import speaking
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import speaking
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.mechanism import MECHANISMS

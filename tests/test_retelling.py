@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin.catalogues import Catalogues
 from twin.diagnosis import experiments
 from twin.diagnosis.answer import insufficient
 from twin.diagnosis.retelling import retold, templates
 from twin.diagnosis.unlisted import Unlisted
-from twin.language import speaking
+from twin.languages.catalogues import Catalogues
+from twin.languages.texts import speaking
 from twin.model.courses import Cause
 from twin.model.mechanism import MECHANISMS
 from twin.model.term import Term

@@ -9,11 +9,11 @@ import pytest
 from babel.messages.catalog import Catalog
 
 from tools.texts import LOCALE, STATIC, is_translated, texts
-from twin.catalogues import Catalogues, read_catalog
 from twin.errors import ConfigError
 from twin.instants import SECOND_NS, age, clock, dated
-from twin.language import Language, notation_within, ntr, numeral, speaking, tr
-from twin.languages import language_of
+from twin.languages.catalogues import Catalogues, read_catalog
+from twin.languages.choice import language_of
+from twin.languages.texts import Language, notation_within, ntr, numeral, speaking, tr
 
 GERMAN = Catalogues().languages["de"]
 NAMES = re.compile(r"\{(\w+)\}")

@@ -19,7 +19,7 @@ from twin.calibration.page import write_page as write_commissioning
 from twin.diagnosis.report import write_report
 from twin.diagnosis.retelling import templates
 from twin.fleet.text import write_page as write_fleet
-from twin.languages import language_of
+from twin.languages.choice import language_of
 from twin.log.recorder import Recorder
 from twin.signals import TICK
 

@@ -20,7 +20,6 @@ from twin.alarms.rules import by_cause, default_rules
 from twin.alarms.text import COMMISSION
 from twin.calibration.page import MARKS
 from twin.calibration.verdict import WEAKENS
-from twin.catalogues import read_catalog
 from twin.diagnosis import text as answer_text
 from twin.diagnosis.curves import DEVIATION
 from twin.diagnosis.experiments import TESTS
@@ -30,6 +29,7 @@ from twin.diagnosis.text import plain_words
 from twin.diagnosis.unlisted import OVER
 from twin.figures.table import FIGURES
 from twin.instants import DATE
+from twin.languages.catalogues import read_catalog
 from twin.model.courses import Course
 from twin.model.effects import EFFECTS
 from twin.model.mechanism import PLACES, WHENS

@@ -44,7 +44,7 @@ from twin.errors import ConfigError
 from twin.errors import TwinError as TwinError  # noqa: PLC0414 (``import twin`` has it)
 from twin.figures.cycle import compiled as key_figures
 from twin.hil import Plant
-from twin.languages import language_of
+from twin.languages.choice import language_of
 from twin.live import Twin
 from twin.log.header import DERIVED, LogHeader
 from twin.log.reader import Log as Recorded

@@ -5,7 +5,7 @@ Clock times are in this computer's time zone.
 
 import time
 
-from twin.language import ntr, tr
+from twin.languages.texts import ntr, tr
 
 SECOND_NS = 1_000_000_000
 DATE, TIME = "%Y-%m-%d", "%H:%M:%S"  # a catalogue has the date of its language

@@ -13,7 +13,7 @@ from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, SourceError, known_names
 from twin.figures.settings import FigureSettings, Limits, limits
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 from twin.model.dataset import DataSet
 from twin.monitor.monitor import MonitorSettings
 

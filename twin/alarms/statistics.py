@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from twin.alarms.board import SUPPRESSION, Episode
 from twin.instants import SECOND_NS, instant, lasting
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 
 DAY_NS = 86_400 * SECOND_NS
 # Limits that ISA-18.2 (2016) recommends; those of EEMUA 191 (edition 3) are the same.

@@ -9,7 +9,7 @@ from twin.alarms.rules import Rule, default_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
-from twin.language import tr
+from twin.languages.texts import tr
 from twin.model.effects import EFFECTS
 
 COMMISSION = "Commission the unit (twin commission): then causes are named."

@@ -31,7 +31,7 @@ from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, sensor_place
 from twin.model.effects import standing_for

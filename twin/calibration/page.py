@@ -15,7 +15,7 @@ from twin.diagnosis.drawing import as_svg
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import capital, listed, spoken
 from twin.files import write_text
-from twin.language import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
+from twin.languages.texts import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
 from twin.signals import MBAR, Samples
 
 MARKS = {"good": ("●", "#2e7d4f"), "usable": ("▲", "#8a5200"), "refused": ("■", "#b3261e")}

@@ -4,7 +4,7 @@ import numpy as np
 
 from twin.diagnosis.curves import Expected, draw_curves
 from twin.diagnosis.drawing import Picture, empty
-from twin.language import tr
+from twin.languages.texts import tr
 from twin.live import Twin
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients

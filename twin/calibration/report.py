@@ -8,7 +8,7 @@ from twin.calibration.commission import Commissioned
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
 from twin.diagnosis.text import spoken
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 from twin.signals import MBAR, MS, Phase
 
 

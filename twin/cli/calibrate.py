@@ -25,8 +25,8 @@ from twin.cli.options import output as output_option
 from twin.cli.stopping import closed
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
-from twin.language import ENGLISH
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import ENGLISH
 
 if TYPE_CHECKING:
     from twin.settings import Document

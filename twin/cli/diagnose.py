@@ -26,8 +26,8 @@ from twin.cli.options import (
 from twin.cli.options import output as output_option
 from twin.cli.setup import settings_of
 from twin.files import require_writable, write_json, write_whole
-from twin.language import ENGLISH
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import ENGLISH
 
 if TYPE_CHECKING:
     from twin.config import Config

@@ -18,8 +18,8 @@ from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError
 from twin.extras import require
 from twin.files import require_writable, write_json
-from twin.language import ENGLISH
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import ENGLISH
 
 if TYPE_CHECKING:
     from sqlalchemy import URL

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.errors import TwinError
-from twin.languages import all_languages, translation_of
+from twin.languages.choice import all_languages, translation_of
 
 MOST_REPORTS = 100  # newest reports that a folder keeps, each in all languages
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from twin.diagnosis.drawing import AFTER, MEASURED, QUIET, Picture, legend
 from twin.diagnosis.text import spoken
-from twin.language import tr
+from twin.languages.texts import tr
 from twin.monitor.bins import Floats, Ints
 from twin.signals import Phase
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, ScalarFormatter
 
 from twin.files import require_ending, said_plainly
-from twin.language import notation, numeral
+from twin.languages.texts import notation, numeral
 
 WIDTH = 9.6  # inches
 LETTER, HANDLE = 0.075, 0.6  # inches of a letter, and of the mark of a name, in a legend

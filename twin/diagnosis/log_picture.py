@@ -11,7 +11,7 @@ from twin.diagnosis.evidence import Evidence
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.text import LONG_S, spoken
-from twin.language import tr
+from twin.languages.texts import tr
 from twin.model.courses import Cause, Course
 from twin.model.effects import Parameter, effect_of
 from twin.monitor.bins import Floats

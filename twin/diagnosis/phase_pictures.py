@@ -25,7 +25,7 @@ from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, of_cycles
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
 from twin.diagnosis.text import spoken
-from twin.language import ntr, tr
+from twin.languages.texts import ntr, tr
 from twin.model import theta as c
 from twin.model.term import KINDS, Term
 from twin.monitor.bins import PER_UNIT, Floats, Ints

@@ -21,7 +21,7 @@ from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Answer, listed, spoken
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 from twin.model import theta as c
 from twin.model.term import Term
 from twin.monitor.bins import Ints

@@ -52,7 +52,7 @@ from twin.diagnosis.text import (
 from twin.errors import ConfigError, known_names
 from twin.files import write_text
 from twin.instants import dated
-from twin.language import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
+from twin.languages.texts import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
 from twin.model import theta as c
 from twin.model.courses import Course
 from twin.model.effects import effect_of

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 
 from twin.figures.warnings import CAUTIONS
-from twin.language import ENGLISH, language_code, notation_within, tr
+from twin.languages.texts import ENGLISH, language_code, notation_within, tr
 from twin.model.mechanism import PLACES, WHENS, Place
 from twin.monitor.healthy import NOT_COMMISSIONED
 

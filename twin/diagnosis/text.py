@@ -10,7 +10,7 @@ from typing import Any
 from twin.diagnosis.retelling import retold
 from twin.figures.money import Interval, interval_text, significant
 from twin.instants import SECOND_NS, dated, instant
-from twin.language import ntr, numeral, tr
+from twin.languages.texts import ntr, numeral, tr
 from twin.model.courses import Course
 from twin.model.effects import effect_of
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from twin.language import numeral, tr
+from twin.languages.texts import numeral, tr
 
 EXACT_FROM = 10.0  # of a currency: amounts from here on have no decimals
 NOTHING = 1e-9  # of a currency: smaller amounts are rounding errors of zero

@@ -11,7 +11,7 @@ from twin.figures.settings import Limits
 from twin.figures.table import FIGURES, NO_DASH, Figure
 from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, Trend, trend_of
 from twin.instants import clock, instant, lasting
-from twin.language import ntr, numeral, tr
+from twin.languages.texts import ntr, numeral, tr
 
 SHOWN = ("t0", "t1", "leakage", "free_flow", "max_vacuum", "nozzle_share", "air", "supply")
 NO_SCATTER = 1e-6  # of the level: equal values give no interval

@@ -15,7 +15,7 @@ from twin.fleet.peers import FEWEST_PEERS, Drift
 from twin.fleet.report import STANDS_OUT, Report, Row, State
 from twin.fleet.type_statistics import Estimate
 from twin.instants import dated
-from twin.language import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
+from twin.languages.texts import ENGLISH, Language, language_code, ntr, numeral, speaking, tr
 
 MOST_LISTED = 15  # units, in the terminal
 GOOD, BAD, UNKNOWN = "#2e7d4f", "#b3261e", "#555555"

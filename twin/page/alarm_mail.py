@@ -7,8 +7,8 @@ from typing import Any
 from twin.alarms.rules import Rule
 from twin.alarms.text import action_of
 from twin.instants import DATE, TIME
-from twin.language import ENGLISH, Language, ntr, speaking, tr
-from twin.languages import language_of
+from twin.languages.choice import language_of
+from twin.languages.texts import ENGLISH, Language, ntr, speaking, tr
 from twin.notifications.escalation import Reason
 from twin.notifications.mail_server import Letter
 from twin.notifications.message import ns_of

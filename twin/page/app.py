@@ -34,9 +34,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from twin.alarms.state import Deed
 from twin.alarms.statistics import DAY_NS, in_words, statistics
 from twin.audit import Act
-from twin.catalogues import Catalogues
 from twin.errors import TwinError
-from twin.language import speaking, tr
+from twin.languages.catalogues import Catalogues
+from twin.languages.texts import speaking, tr
 from twin.login import Authenticator
 from twin.page.ejector import Ejector
 from twin.page.plant_overview import PlantOverview

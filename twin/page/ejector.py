@@ -27,8 +27,8 @@ from twin.figures.table import FIGURES, Figure
 from twin.figures.text import course_in_words, title_of, trend_of_figure
 from twin.figures.trend import DAY_NS, Trend
 from twin.instants import zone
-from twin.language import tr
-from twin.languages import translation_of
+from twin.languages.choice import translation_of
+from twin.languages.texts import tr
 from twin.page import ring
 from twin.page.bins import json_numbers
 from twin.page.curve import Curves, document_of

@@ -17,7 +17,7 @@ from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import Times, capital, certainty, ends, number, plain_words, spoken, when
 from twin.figures.table import NO_DASH
 from twin.instants import instant, lasting
-from twin.language import ENGLISH, language_code, numeral, tr
+from twin.languages.texts import ENGLISH, language_code, numeral, tr
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.monitor.healthy import NOT_COMMISSIONED
 

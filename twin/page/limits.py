@@ -6,7 +6,7 @@ from typing import Any
 from twin.alarms.limits import ADJUSTABLE, AdjustableLimit, UnitLimits, with_unit
 from twin.alarms.requests import LimitChange
 from twin.instants import instant
-from twin.language import tr
+from twin.languages.texts import tr
 
 MOST_CHANGES = 200  # that are listed
 

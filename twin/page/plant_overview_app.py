@@ -9,7 +9,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from twin.assets.unit import Unit
-from twin.language import tr
+from twin.languages.texts import tr
 from twin.page.plant_overview import PlantOverview
 from twin.page.plant_overview_text import counted, details, of_one, overview
 

@@ -16,7 +16,7 @@ from twin.figures.database import SIDES
 from twin.figures.table import FIGURES
 from twin.figures.text import title_of
 from twin.instants import SECOND_NS, instant, lasting, zone
-from twin.language import ENGLISH, speaking, tr
+from twin.languages.texts import ENGLISH, speaking, tr
 from twin.page.ejector import figure_labels
 from twin.page.ejector_status import (
     WORST_FIRST,

@@ -9,7 +9,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.pofile import read_po
 from babel.numbers import get_decimal_symbol
 
-from twin.language import ENGLISH, Language
+from twin.languages.texts import ENGLISH, Language
 
 MOST_ASKED = 20  # languages of a browser that are considered
 THIN_SPACE = "\u202f"  # between thousands after ISO 80000-1; a line does not break there

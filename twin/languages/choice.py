@@ -4,7 +4,7 @@ from pathlib import Path
 
 from twin.errors import ConfigError, known_names
 from twin.extras import require
-from twin.language import ENGLISH, Language
+from twin.languages.texts import ENGLISH, Language
 
 
 def language_of(code: str, name: str) -> Language:
@@ -15,7 +15,7 @@ def language_of(code: str, name: str) -> Language:
     if code == ENGLISH.code:
         return ENGLISH
     require("serve", f'{name} "{code}"', "babel")
-    from twin.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
+    from twin.languages.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
 
     languages = Catalogues().languages
     if code not in languages:
@@ -26,7 +26,7 @@ def language_of(code: str, name: str) -> Language:
 def all_languages() -> list[Language]:
     """All languages, English first; only English if the reader of catalogues is not installed."""
     try:
-        from twin.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
+        from twin.languages.catalogues import Catalogues  # noqa: PLC0415 - of the extra serve
     except ImportError:
         return [ENGLISH]
     return list(Catalogues().languages.values())

@@ -1,0 +1,1 @@
+"""Languages of texts for people. A new one is a catalogue: ``python tools/texts.py fr``."""
