@@ -27,8 +27,8 @@ from twin.calibration.commission import guessed
 from twin.calibration.readings import read
 from twin.model.dataset import coefficients
 from twin.monitor.detector_window import as_wide_as_needed, expected_knees
-from twin.monitor.nozzle import noise_of, switchings
-from twin.monitor.phase_detector import PhaseFinder
+from twin.monitor.offline_switching import noise_of, switchings
+from twin.monitor.switching_detector import PhaseFinder
 from twin.signals import MS, NS, Phase, Reported, Samples
 
 STAMP = 1.0 * MS  # by which a record's stamps are late

@@ -18,7 +18,7 @@ from twin.model.theta import Theta
 from twin.monitor.detector_window import expected_knees
 from twin.monitor.isolation import Isolation
 from twin.monitor.monitor import Monitor
-from twin.monitor.phase_detector import Knees
+from twin.monitor.switching_detector import Knees
 from twin.settings import Document
 from twin.signals import MBAR, Quality, Samples, Ticks
 

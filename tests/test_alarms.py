@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from tools.readme import filled
+from twin.alarms.advice import action_of
 from twin.alarms.board import Board, Diary, Episode
 from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
-from twin.alarms.text import action_of
 from twin.alarms.watch import NAMES, deviating, values
 from twin.errors import ConfigError
 from twin.events import Event, Kind

@@ -11,17 +11,17 @@ import rigs
 
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.hypotheses import often, price
 from twin.diagnosis.linear_screening import columns, promises, signatures
+from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
 from twin.monitor.detector_window import as_wide_as_needed, expected_knees
-from twin.monitor.phase_detector import PhaseFinder
+from twin.monitor.switching_detector import PhaseFinder
 from twin.settings import Document
 from twin.signals import MBAR, Phase, Samples
 

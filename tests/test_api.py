@@ -33,7 +33,7 @@ from twin.config import Config
 from twin.diagnosis.curves import outline
 from twin.errors import ConfigError
 from twin.extras import install_hint
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.hil import Plant
 from twin.log.reader import open_log
 from twin.settings import Document

@@ -19,7 +19,7 @@ from twin.alarms import statistics
 from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
 from twin.figures import cycle_view as course
-from twin.figures import table, trend
+from twin.figures import key_figures, trend
 from twin.figures import writer as keeper
 from twin.fleet import peers, report
 from twin.hil import LONGEST_GAP_S
@@ -116,7 +116,12 @@ CLAIMS = (
         (100.0 * drawings.LONGER, drawings.LONGER_MS, drawings.LEVEL / MBAR),
     ),
     ("key-figures", "a hole in the readings of more than {:g} ms", (), (course.LONGEST_HOLE / MS,)),
-    ("key-figures", "by less than {:g} mbar/s over its last half second", (), (table.STEADY,)),
+    (
+        "key-figures",
+        "by less than {:g} mbar/s over its last half second",
+        (),
+        (key_figures.STEADY,),
+    ),
     ("key-figures", "up to {} cycles wait in memory", (), (keeper.MOST_WAITING,)),
     ("key-figures", "in up to {} bins of time", (), (trend.BINS,)),
     ("key-figures", "unless the slope is sure to {:g} %", (), (100.0 * trend.SURE,)),

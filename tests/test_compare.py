@@ -23,7 +23,7 @@ from twin.compare.compare import (
 from twin.compare.side import BIN_S, Curve, Side, bins, difference, side_of, whole
 from twin.compare.text import conclusion, in_words, plain, remarks
 from twin.figures.cycle import KeyFigures
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.live import run as run_loop
 from twin.log.header import LogHeader
 from twin.log.reader import open_log

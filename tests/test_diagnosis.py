@@ -21,19 +21,19 @@ from twin.config import Config
 from twin.diagnosis import answer as answer_module
 from twin.diagnosis import search as search_module
 from twin.diagnosis.answer import EXPLAINED, Diagnosis, _left_in_all, diagnose
-from twin.diagnosis.covariance import covariance, levels
 from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import gain, judge
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.linear_screening import signatures
+from twin.diagnosis.residual_covariance import covariance, levels
 from twin.diagnosis.search import _about, _confirmed, held_out_gain, tried_in_or_out
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.monitor.cycles import PAPER_VACUUM
-from twin.monitor.phase_detector import Knees
+from twin.monitor.switching_detector import Knees
 from twin.settings import Document
 from twin.signals import MBAR, NS, Command, Phase, Quality, Samples
 

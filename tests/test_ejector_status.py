@@ -2,10 +2,10 @@
 
 import pytest
 
+from twin.alarms.advice import action_of
 from twin.alarms.board import Board, Episode
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Kept
-from twin.alarms.text import action_of
 from twin.instants import instant
 from twin.languages.choice import language_of
 from twin.languages.texts import speaking

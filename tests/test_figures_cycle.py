@@ -18,8 +18,8 @@ from drivers.plc.simulate import blocks
 from twin.events import Event, Kind
 from twin.figures.cycle import MOST_PIECES, CycleFigures, KeyFigures
 from twin.figures.expected import Expectation
+from twin.figures.key_figures import FIGURES
 from twin.figures.settings import FigureSettings
-from twin.figures.table import FIGURES
 from twin.live import run
 from twin.model.dataset import DataSet
 from twin.model.term import Term

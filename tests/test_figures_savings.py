@@ -15,11 +15,11 @@ from test_figures_costs import PRICE, logged
 
 from twin.errors import ConfigError
 from twin.figures.costs import NO_PRICE, Tariff
+from twin.figures.key_figures import Unit
 from twin.figures.savings import LEAST_MARGIN, MOST_CYCLES, Prediction, Savings, Setting, savings
 from twin.figures.savings_text import NOT_KNOWN, UNCERTAIN, savings_plain, savings_table
 from twin.figures.settings import FigureSettings
 from twin.figures.simulated import Program, simulated, spread, whole_cycles
-from twin.figures.table import Unit
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.healthy import Healthy
 from twin.signals import Command

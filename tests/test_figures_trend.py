@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from twin.figures.key_figures import FIGURES
 from twin.figures.settings import FigureSettings, limits
-from twin.figures.table import FIGURES
 from twin.figures.text import _give_or_take, in_words, limit_of, trend_plain
 from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
 from twin.model.dataset import DataSet

@@ -14,8 +14,8 @@ from twin.calibration.parameters import FREE
 from twin.errors import SourceError
 from twin.fleet.peers import DAY_NS, FEWEST_PEERS, standings
 from twin.fleet.report import Refused, Report, State, report
+from twin.fleet.report_page import headline, in_words, write_page
 from twin.fleet.results_database import Key, Result
-from twin.fleet.text import headline, in_words, write_page
 from twin.fleet.type_statistics import estimates
 from twin.languages.choice import language_of
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from twin.inference.covariance import Floats
 from twin.inference.gauss_newton import MOST_ROUNDS, Descent, descend, information
+from twin.inference.whitening import Floats
 
 TIMES = np.linspace(0.0, 3.0, 40)
 

@@ -7,9 +7,9 @@ import pytest
 import rigs
 from rigs import Collect
 
+from twin.alarms.advice import COMMISSION
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.text import COMMISSION
 from twin.cli.setup import pair_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose

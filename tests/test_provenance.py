@@ -152,7 +152,7 @@ NEEDS_EXTRA = {
     "twin/figures/export.py": "tables",
     "twin/figures/picture.py": "reports",
     "twin/fleet/engines.py": "dask",
-    "twin/fleet/text.py": "fleet",
+    "twin/fleet/report_page.py": "fleet",
     "twin/paper/picture.py": "reports",
     "twin/tables/": "tables",
     "twin/languages/catalogues.py": "serve",

@@ -16,7 +16,6 @@ from written_pages import ENGLISH_WORDS, visible
 
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.drawing import as_svg
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
@@ -45,6 +44,7 @@ from twin.diagnosis.pictures import (
     worst_cycle,
 )
 from twin.diagnosis.report import in_words, write_report
+from twin.diagnosis.residual_covariance import covariance
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError

@@ -9,8 +9,8 @@ import rigs
 
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import with_truth
-from twin.monitor.nozzle import noise_of, switchings
-from twin.monitor.phase_detector import PhaseFinder, commanded
+from twin.monitor.offline_switching import noise_of, switchings
+from twin.monitor.switching_detector import PhaseFinder, commanded
 from twin.signals import Command, Phase, Reported, Samples
 
 NEAR = 60  # rows within which a switching found is that of the valve

@@ -13,11 +13,11 @@ from second_world.records import Record, record
 from twin.calibration import commission as module
 from twin.calibration import fit as fitting
 from twin.calibration.commission import as_metered, commission, guessed, starts
-from twin.calibration.covariance import plain, weighted
 from twin.calibration.cycles import LAG, SPAN, ZERO, Cycles
 from twin.calibration.fit import Fitted, Round, fit_from_afar, second_noise
 from twin.calibration.flow_meter import stored
 from twin.calibration.readings import Readings, read
+from twin.calibration.residual_covariance import plain, weighted
 from twin.config import Config
 from twin.model import kernel
 from twin.model import theta as c

@@ -44,7 +44,7 @@ def texts() -> str:
             lines += spoken(ast.parse(file.read_text(encoding="utf-8")))
     for file in (ROOT / "twin" / "page" / "static").glob("*.js"):
         lines += re.findall(r'"([^"\n]+)"', file.read_text(encoding="utf-8"))
-    alarms = tomllib.loads((ROOT / "twin" / "alarms" / "default.toml").read_text())
+    alarms = tomllib.loads((ROOT / "twin" / "alarms" / "default_rules.toml").read_text())
     lines += [rule["name"] for rule in alarms["alarm"]]
     return "\n".join(line.replace("\n", " ") for line in lines)
 

@@ -18,7 +18,7 @@ from written_pages import ENGLISH_WORDS, UNIT, commissioned, visible
 from twin.calibration.page import write_page as write_commissioning
 from twin.diagnosis.report import write_report
 from twin.diagnosis.retelling import templates
-from twin.fleet.text import write_page as write_fleet
+from twin.fleet.report_page import write_page as write_fleet
 from twin.languages.choice import language_of
 from twin.log.recorder import Recorder
 from twin.signals import TICK

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from tools.battery_cases import Hidden
 from tools.battery_first import Unit, drawn_case
 from tools.calibration_coverage import SYSTEMS
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.residual_covariance import covariance
 from twin.model.term import KINDS
 from twin.monitor.bins import warped
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Scatter

@@ -28,9 +28,9 @@ from tools.mechanism_worlds import CHANGES, Change, Subject, changed_config, fir
 from tools.version import commit
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, collect
 from twin.diagnosis.held_out import LITTLE, judge
+from twin.diagnosis.residual_covariance import covariance
 from twin.errors import TwinError
 from twin.signals import Samples
 

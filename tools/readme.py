@@ -7,7 +7,7 @@ from drivers.plc.registers import table as register_table
 from twin.alarms.text import rules_table as alarm_rules_table
 from twin.alarms.text import table as alarm_states_table
 from twin.figures.curve import table as curve_table
-from twin.figures.table import table as figures_table
+from twin.figures.key_figures import table as figures_table
 from twin.figures.warnings import table as warnings_table
 from twin.model.courses import table as courses_table
 from twin.model.effects import table as effects_table

@@ -14,10 +14,10 @@ from babel.messages.catalog import Catalog, Message
 from babel.messages.extract import extract_from_file
 from babel.messages.pofile import write_po
 
+from twin.alarms.advice import COMMISSION
 from twin.alarms.causes import cause_of
 from twin.alarms.limits import ADJUSTABLE
 from twin.alarms.rules import by_cause, default_rules
-from twin.alarms.text import COMMISSION
 from twin.calibration.page import MARKS
 from twin.calibration.verdict import WEAKENS
 from twin.diagnosis import text as answer_text
@@ -27,7 +27,7 @@ from twin.diagnosis.report import BANNER
 from twin.diagnosis.retelling import templates
 from twin.diagnosis.text import plain_words
 from twin.diagnosis.unlisted import OVER
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.instants import DATE
 from twin.languages.catalogues import read_catalog
 from twin.model.courses import Course
@@ -73,14 +73,16 @@ def _in_tables() -> Iterator[Text]:
         for text in (plain_words(effect.name), effect.sentence, effect.look_at):
             yield "twin/model/effects.py", text
     for rule in by_cause(default_rules()):
-        yield from (("twin/alarms/default.toml", text) for text in (rule.consequence, rule.action))
+        yield from (
+            ("twin/alarms/default_rules.toml", text) for text in (rule.consequence, rule.action)
+        )
         if not cause_of(rule.value):
-            yield "twin/alarms/default.toml", light.spelt(rule.name)
+            yield "twin/alarms/default_rules.toml", light.spelt(rule.name)
     for figure in FIGURES.values():
-        yield "twin/figures/table.py", figure.name.replace("_", " ")
-        yield "twin/figures/table.py", figure.what
+        yield "twin/figures/key_figures.py", figure.name.replace("_", " ")
+        yield "twin/figures/key_figures.py", figure.what
     yield "twin/monitor/healthy.py", NOT_COMMISSIONED
-    yield "twin/alarms/text.py", COMMISSION
+    yield "twin/alarms/advice.py", COMMISSION
     for table in (light.WITHOUT, light.WORDS, light.STATES, light.PRIORITIES):
         yield from (("twin/page/ejector_status.py", text) for text in table.values())
     for text in (*hall_words.WORDS.values(), hall_words.SILENT, hall_words.NOT_KNOWN):

@@ -17,10 +17,10 @@ from twin.model.theta import Theta
 from twin.monitor.detector_window import knees_of
 from twin.monitor.gaps import ShortGaps
 from twin.monitor.monitor import Monitor, in_order
-from twin.monitor.phase_detector import Found, Knees, PhaseFinder
 from twin.monitor.rows import TimeSteps
 from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
+from twin.monitor.switching_detector import Found, Knees, PhaseFinder
 from twin.signals import SAMPLE, TICK, Command, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: work on many cycles uses the caches well

@@ -5,10 +5,10 @@ from typing import Any
 
 import pyarrow as pa
 
+from twin.alarms.advice import action_of
 from twin.alarms.board import Episode
 from twin.alarms.rules import Rule
 from twin.alarms.state import Alarm
-from twin.alarms.text import action_of
 from twin.assets.unit import Unit
 
 _TIME = pa.timestamp("ns", "UTC")

@@ -98,8 +98,8 @@ def read_rules(document: Document) -> tuple[Rule, ...]:
 
 def default_rules() -> tuple[Rule, ...]:
     """The rules that come with the program."""
-    text = resources.files("twin.alarms").joinpath("default.toml").read_text(encoding="utf-8")
-    return read_rules(Document.parse(text, "default.toml"))
+    text = resources.files("twin.alarms").joinpath("default_rules.toml").read_text(encoding="utf-8")
+    return read_rules(Document.parse(text, "default_rules.toml"))
 
 
 def write_rules(rules: Sequence[Rule]) -> str:

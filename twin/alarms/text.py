@@ -3,16 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
+from twin.alarms.advice import action_of
 from twin.alarms.board import Episode
-from twin.alarms.causes import cause_of
 from twin.alarms.rules import Rule, default_rules
 from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
 from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
-from twin.languages.texts import tr
-from twin.model.effects import EFFECTS
 
-COMMISSION = "Commission the unit (twin commission): then causes are named."
 STATES = {
     State.NORMAL: "nothing to do",
     State.UNACKNOWLEDGED: "active, and nobody has acknowledged it",
@@ -45,18 +42,6 @@ def table() -> str:
 def is_reportable(change: Change, alarm: Alarm) -> bool:
     """Whether to report a change; suppression of an alarm that concerns nobody is not reported."""
     return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
-
-
-def action_of(rule: Rule, evidence: Evidence) -> str:
-    """What to do, beginning with where to look; a unit must be commissioned before all else."""
-    if evidence.get("commissioned") is False:
-        return tr(COMMISSION)
-    cause, catalogued = cause_of(rule.value), evidence.get("taken_in")
-    if cause not in EFFECTS and not catalogued:
-        return tr(rule.action)
-    location = catalogued["look_at"] if catalogued else tr(EFFECTS[cause].look_at)
-    look = tr("Look at {where}.", where=location)
-    return f"{look} {tr(rule.action)}".rstrip()
 
 
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 from twin.alarms.causes import CAUSES, DEVIATION, catalogue_evidence, cause_or_unlisted, value_of
 from twin.events import Event, Kind
-from twin.figures.table import FIGURES, NO_DASH
+from twin.figures.key_figures import FIGURES, NO_DASH
 from twin.figures.warnings import CAUTIONS
 from twin.model.effects import UNKNOWN
 

@@ -14,9 +14,9 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
-from twin.monitor.nozzle import Switching, noise_of, switchings
-from twin.monitor.phase_detector import PhaseFinder, commanded
+from twin.monitor.offline_switching import Switching, noise_of, switchings
 from twin.monitor.rows import time_steps
+from twin.monitor.switching_detector import PhaseFinder, commanded
 from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
 
 BINS = 6  # in each unit of warped time

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from twin.calibration.covariance import Weights, plain, weighted
 from twin.calibration.cycles import Both, Cycles
 from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.parameters import FREE_IN_MARKET, Free, Space
 from twin.calibration.readings import noise_of
+from twin.calibration.residual_covariance import Weights, plain, weighted
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from twin.calibration.flow_meter import Suction, stored
 from twin.figures.curve import flow_behind
 from twin.model.gas import R
-from twin.monitor.nozzle import reports_nozzle, told_edges
+from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at
 from twin.monitor.surroundings import told
 from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples

@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from twin.calibration.covariance import weighted
 from twin.calibration.cycles import Cycles
+from twin.calibration.residual_covariance import weighted
 from twin.errors import ConfigError
 from twin.inference.sensitivities import coefficients_at, inside, sensitivities
 from twin.model import theta as c

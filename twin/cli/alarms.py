@@ -448,7 +448,7 @@ def _await_answer(store: "Store", number: int, name: str, deed: "Deed") -> str:
 
 
 def _plain_alarm(alarm: "Alarm", episode: "Episode | None", unit: "Unit") -> dict[str, Any]:
-    from twin.alarms.text import action_of
+    from twin.alarms.advice import action_of
 
     rule = alarm.rule
     return {

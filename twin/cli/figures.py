@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from twin.figures.costs import Tariff
     from twin.figures.cycle import CycleFigures, KeyFigures
     from twin.figures.database import History, Store
+    from twin.figures.key_figures import Figure
     from twin.figures.settings import FigureSettings, Limits
-    from twin.figures.table import Figure
     from twin.figures.writer import Keeper
     from twin.log.reader import Log
     from twin.settings import Document
@@ -151,12 +151,12 @@ def savings(
     json_file: JsonAlone = None,
 ) -> None:
     """What another H1, hysteresis or supply pressure would save, as the model predicts it."""
+    from twin.figures.key_figures import Unit
     from twin.figures.savings import MOST_CYCLES
     from twin.figures.savings import savings as predict
     from twin.figures.savings_text import savings_plain, savings_table
     from twin.figures.settings import FigureSettings
     from twin.figures.simulated import Program, mean_cycle_time, spread, whole_cycles
-    from twin.figures.table import Unit
 
     require_writable(json_file)
     recorded, settings = _opened(log, config, unit)
@@ -401,7 +401,7 @@ def _history(
 
 
 def _chosen_figures(names: list[str] | None, picture: Path | None) -> "list[Figure]":
-    from twin.figures.table import FIGURES
+    from twin.figures.key_figures import FIGURES
 
     unknown = [name for name in names or [] if name not in FIGURES]
     if unknown:

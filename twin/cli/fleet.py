@@ -124,7 +124,10 @@ def report(
     require_writable(json_file, page)
     page_language = language_of(language, "--language")
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)
-    from twin.fleet.text import in_words, write_page  # with Matplotlib, which the engine requires
+    from twin.fleet.report_page import (  # with Matplotlib, which the engine requires
+        in_words,
+        write_page,
+    )
 
     fleet = _Fleet.of(config, assets, to_store=bool(files))
     outcomes = _done("replay", files, fleet, workers_of) if files else []

@@ -92,7 +92,7 @@ def run(
     from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
     from twin.cli.compiling import Models
-    from twin.figures.table import FIGURES
+    from twin.figures.key_figures import FIGURES
     from twin.run_many import run_together
     from twin.settings import Document
 

@@ -16,7 +16,7 @@ from scipy import stats
 
 from twin.compare.side import Side
 from twin.figures.curve import CURVE
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.inference.levels import UPPER_95
 from twin.signals import Phase
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from twin.compare.compare import FEWEST, Comparison, Quantity, Values
 from twin.compare.side import Side
-from twin.figures.table import NO_DASH
+from twin.figures.key_figures import NO_DASH
 
 FORMAT = "ejector-twin-compare/1"
 NAMED = 3  # in the conclusion

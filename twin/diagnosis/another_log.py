@@ -8,10 +8,10 @@ import numpy as np
 
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, insufficient
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, read_again, read_cycles
 from twin.diagnosis.extend import extended, swings
 from twin.diagnosis.held_out import Judged, gain, judge
+from twin.diagnosis.residual_covariance import covariance
 from twin.errors import SourceError
 from twin.model.courses import Cause
 from twin.signals import Samples

@@ -9,7 +9,6 @@ import numpy as np
 
 from twin.config import Config
 from twin.diagnosis.costs import costs
-from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import (
     HEALTHY,
     Evidence,
@@ -26,6 +25,7 @@ from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
+from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled

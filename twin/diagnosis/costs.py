@@ -15,10 +15,10 @@ import numpy as np
 from twin.config import Config
 from twin.diagnosis.evidence import Evidence, Hypothesis, at_once
 from twin.figures.costs import Tariff
+from twin.figures.key_figures import Unit
 from twin.figures.money import Interval
 from twin.figures.settings import FigureSettings
 from twin.figures.simulated import Program, mean_air, mean_cycle_time, simulated
-from twin.figures.table import Unit
 from twin.inference.levels import SIGMAS_95
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients

@@ -34,10 +34,10 @@ from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
-from twin.monitor.phase_detector import Knees
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import medians_of, surrounded
+from twin.monitor.switching_detector import Knees
 from twin.monitor.uncertain_data import shifted
 from twin.signals import (
     MBAR,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.evidence import Evidence, Hypothesis, of_log
 from twin.diagnosis.fit import fit
 from twin.diagnosis.mechanisms import Explained
+from twin.diagnosis.residual_covariance import covariance
 from twin.diagnosis.search import Search
 from twin.model import kernel
 from twin.model import theta as c

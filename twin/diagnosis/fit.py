@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
+from twin.diagnosis.residual_covariance import Weights, levels
 from twin.inference.gauss_newton import Descent, descend, information
 from twin.inference.levels import CHI2_95
 from twin.inference.profile import profile_interval

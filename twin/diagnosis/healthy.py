@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.diagnosis.covariance import Covariance, Weights, moved, scatter
 from twin.diagnosis.evidence import HEALTHY, Evidence
+from twin.diagnosis.residual_covariance import Covariance, Weights, moved, scatter
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError

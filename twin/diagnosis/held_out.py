@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.healthy import left_in_each, usual_leftover
+from twin.diagnosis.residual_covariance import Weights, levels
 from twin.inference.levels import UPPER_95
 from twin.model import theta as c
 from twin.monitor.bins import Floats, Ints

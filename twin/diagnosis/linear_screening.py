@@ -10,9 +10,9 @@ from itertools import chain, combinations
 
 import numpy as np
 
-from twin.diagnosis.covariance import Weights, levels
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
+from twin.diagnosis.residual_covariance import Weights, levels
 from twin.inference.sensitivities import derivatives
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course

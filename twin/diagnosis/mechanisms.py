@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from twin.diagnosis.covariance import Weights, covariance
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
+from twin.diagnosis.residual_covariance import Weights, covariance
 from twin.inference.levels import CHI2_999
 from twin.model import theta as c
 from twin.model.catalogue import has_room

@@ -7,7 +7,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from twin.diagnosis.covariance import covariance
 from twin.diagnosis.curves import DEVIATION
 from twin.diagnosis.drawing import (
     AFTER,
@@ -24,6 +23,7 @@ from twin.diagnosis.drawing import (
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, of_cycles
 from twin.diagnosis.held_out import Judged
 from twin.diagnosis.pictures import Found, spread
+from twin.diagnosis.residual_covariance import covariance
 from twin.diagnosis.text import spoken
 from twin.languages.texts import ntr, tr
 from twin.model import theta as c

@@ -14,7 +14,6 @@ from itertools import chain, combinations
 
 import numpy as np
 
-from twin.diagnosis.covariance import Covariance, Weights, covariance
 from twin.diagnosis.evidence import (
     HEALTHY,
     Evidence,
@@ -41,6 +40,7 @@ from twin.diagnosis.linear_screening import (
     promises,
     signatures,
 )
+from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course

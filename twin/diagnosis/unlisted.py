@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from twin.diagnosis.covariance import Covariance, Weights, levels
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
+from twin.diagnosis.residual_covariance import Covariance, Weights, levels
 from twin.inference.unmodelled import hats, knots_over
 from twin.model import theta as c
 from twin.model.courses import Cause

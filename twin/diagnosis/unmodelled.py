@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from twin.diagnosis.covariance import Weights
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import white
+from twin.diagnosis.residual_covariance import Weights
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.inference.unmodelled import MISMATCH, Odds, alone, log_likelihoods
 from twin.model.effects import effect_of

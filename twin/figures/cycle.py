@@ -10,8 +10,8 @@ import numpy as np
 from twin.config import Config
 from twin.figures.cycle_view import Rows, measured
 from twin.figures.expected import Expectation
+from twin.figures.key_figures import FIGURES, UNKNOWN, Unit, figures
 from twin.figures.settings import FigureSettings, Limits, limits
-from twin.figures.table import FIGURES, UNKNOWN, Unit, figures
 from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle

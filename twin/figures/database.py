@@ -34,7 +34,7 @@ from sqlalchemy import (
 
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 
 FIGURE_DATABASE = Purpose("figure database", "--figures", "figures")
 SIDES = ("measured", "expected")

@@ -7,7 +7,7 @@ import pyarrow as pa
 from twin.assets.unit import Unit
 from twin.figures.costs import Consumption, Tariff
 from twin.figures.database import SIDES, History
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 
 UNITS = {f"{figure.name}_{side}": figure.unit for figure in FIGURES.values() for side in SIDES}
 

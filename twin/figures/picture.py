@@ -10,7 +10,7 @@ from matplotlib.figure import Figure as Picture
 
 from twin.errors import SourceError
 from twin.figures.database import History
-from twin.figures.table import Figure
+from twin.figures.key_figures import Figure
 from twin.figures.trend import DAY_NS, Trend
 
 MOST_POINTS = 5000  # of cycles

@@ -12,9 +12,9 @@ import numpy as np
 
 from twin.errors import ConfigError
 from twin.figures.cycle_view import Floats
+from twin.figures.key_figures import Unit
 from twin.figures.money import Interval
 from twin.figures.simulated import Program, SimulatedCycle, mean_air, simulated
-from twin.figures.table import Unit
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.control import PROTECTED_S, PROTECTED_SWITCHES

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from twin.figures.cycle_view import Bytes, Floats, Rows
-from twin.figures.table import Unit, figures
+from twin.figures.key_figures import Unit, figures
 from twin.model import dense_solver
 from twin.model import theta as c
 from twin.model.term import Terms

@@ -7,8 +7,8 @@ from typing import Any
 
 from twin.figures.curve import CURVE, Reading, Stretch, readings
 from twin.figures.database import History
+from twin.figures.key_figures import FIGURES, NO_DASH, Figure
 from twin.figures.settings import Limits
-from twin.figures.table import FIGURES, NO_DASH, Figure
 from twin.figures.trend import FARTHEST, FEWEST_BINS, SURE, Line, Reach, Step, Trend, trend_of
 from twin.instants import clock, instant, lasting
 from twin.languages.texts import ntr, numeral, tr

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.config import Config
 from twin.figures.cycle import CycleFigures, compiled
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.live import Twin
 from twin.monitor.cycles import CycleCutter, figures
 from twin.monitor.model_bank import SUSPECTS, ModelBank, Suspect

@@ -11,8 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from twin.inference.covariance import Floats
 from twin.inference.sensitivities import derivatives, inside, points
+from twin.inference.whitening import Floats
 
 MOST_ROUNDS = 10
 LONGEST = 6.0  # typical sizes: the longest step of one round

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.inference.covariance import Floats
 from twin.inference.priors import tempered
+from twin.inference.whitening import Floats
 from twin.model.effects import Effect
 
 MISMATCH = 0.08  # of what an effect explains, that its waveform is off

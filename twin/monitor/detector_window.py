@@ -1,4 +1,4 @@
-"""Window of the phase detector: how wide a system's breakpoints need it, and how late they show."""
+"""Window of the switching detector: how wide breakpoints need it, and how late they show."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -12,8 +12,8 @@ from twin.model.dataset import DataSet, coefficients, swing
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
-from twin.monitor.phase_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
 from twin.monitor.simulated_switching import seen
+from twin.monitor.switching_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
 from twin.signals import MBAR, MS, Phase, Samples
 
 SHARP, ROUNDED = 2.5, 2.0  # wanted significance over SIGNIFICANT: of a sharp break, a rounded one

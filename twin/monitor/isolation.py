@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.priors import penalty
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH
+from twin.inference.whitening import Covariance, fading, low_rank
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import KINDS

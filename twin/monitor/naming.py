@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.inference.covariance import Covariance, fading, low_rank
 from twin.inference.gauss_newton import Descent, descend
 from twin.inference.priors import penalty
 from twin.inference.sensitivities import coefficients_at, derivatives
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH, Odds, hats, knots_over, log_likelihoods
+from twin.inference.whitening import Covariance, fading, low_rank
 from twin.model import kernel
 from twin.model.effects import EFFECTS, UNKNOWN, Effect
 from twin.model.theta import Theta

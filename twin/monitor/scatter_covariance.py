@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from twin.inference.covariance import add_independent, fading, low_rank
+from twin.inference.whitening import add_independent, fading, low_rank
 from twin.model.effects import EFFECTS, Parameter
 from twin.model.term import AGAIN, KINDS
 from twin.monitor.bins import Bins, Floats, Ints, warped

@@ -16,7 +16,7 @@ from twin.model import theta as c
 from twin.model.gas import R
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
-from twin.monitor.phase_detector import Knees, PhaseFinder
+from twin.monitor.switching_detector import Knees, PhaseFinder
 from twin.signals import BREAK, MBAR, NS, SL_MIN, UNUSABLE, Command, Phase, Reported, Samples
 
 PATIENCE = 2  # cycles in a row that must contradict, or agree again

@@ -16,7 +16,7 @@ from twin.model import theta as c
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
-from twin.monitor.phase_detector import Knees, PhaseFinder
+from twin.monitor.switching_detector import Knees, PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle

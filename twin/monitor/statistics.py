@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from twin.inference.covariance import Covariance
 from twin.inference.sensitivities import derivatives
+from twin.inference.whitening import Covariance
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, averaged
@@ -28,9 +28,9 @@ from twin.monitor.model_bank import (
     suspects_of,
     variants,
 )
-from twin.monitor.phase_detector import Knees
 from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
 from twin.monitor.simulated_switching import seen
+from twin.monitor.switching_detector import Knees
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time

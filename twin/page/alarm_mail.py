@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
+from twin.alarms.advice import action_of
 from twin.alarms.rules import Rule
-from twin.alarms.text import action_of
 from twin.instants import DATE, TIME
 from twin.languages.choice import language_of
 from twin.languages.texts import ENGLISH, Language, ntr, speaking, tr

@@ -22,8 +22,8 @@ from twin.config import Config
 from twin.errors import ConfigError, TwinError
 from twin.figures.database import SIDES
 from twin.figures.database_url import open_chosen as open_figures
+from twin.figures.key_figures import FIGURES, Figure
 from twin.figures.settings import Limits
-from twin.figures.table import FIGURES, Figure
 from twin.figures.text import course_in_words, title_of, trend_of_figure
 from twin.figures.trend import DAY_NS, Trend
 from twin.instants import zone

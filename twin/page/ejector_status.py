@@ -7,15 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import Any
 
+from twin.alarms.advice import action_of
 from twin.alarms.board import Board, Comment, Episode
 from twin.alarms.causes import UNLISTED, cause_of
 from twin.alarms.requests import Request
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Alarm, State
-from twin.alarms.text import action_of
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import Times, capital, certainty, ends, number, plain_words, spoken, when
-from twin.figures.table import NO_DASH
+from twin.figures.key_figures import NO_DASH
 from twin.instants import instant, lasting
 from twin.languages.texts import ENGLISH, language_code, numeral, tr
 from twin.model.effects import EFFECTS, UNKNOWN

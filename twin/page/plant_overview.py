@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 from twin.assets.unit import Unit
 from twin.figures.database import SIDES
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.notifications.data import CYCLE, CYCLE_FORMAT, VALUES, VALUES_FORMAT
 from twin.notifications.message import ALARM_FORMAT, STATUS_FORMAT
 from twin.notifications.sender import ALARM

@@ -7,13 +7,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from twin.alarms.advice import action_of
 from twin.alarms.causes import CAUSES, DEVIATION, value_of
 from twin.alarms.rules import Priority, by_cause, default_rules
 from twin.alarms.state import State
-from twin.alarms.text import action_of
 from twin.assets.unit import Unit
 from twin.figures.database import SIDES
-from twin.figures.table import FIGURES
+from twin.figures.key_figures import FIGURES
 from twin.figures.text import title_of
 from twin.instants import SECOND_NS, instant, lasting, zone
 from twin.languages.texts import ENGLISH, speaking, tr

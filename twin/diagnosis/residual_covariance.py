@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.inference import covariance as parts
+from twin.inference import whitening as parts
 from twin.inference.sensitivities import central, derivatives
 from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.calibration.cycles import Cycles
-from twin.inference.covariance import Covariance, add_independent, fading, low_rank
 from twin.inference.sensitivities import coefficients_at, sensitivities
+from twin.inference.whitening import Covariance, add_independent, fading, low_rank
 from twin.model import theta as c
 from twin.model.effects import standing_for
 from twin.model.theta import Theta

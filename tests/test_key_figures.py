@@ -22,8 +22,8 @@ from twin.figures.cycle_view import (
 )
 from twin.figures.cycle_view import course as found_in
 from twin.figures.expected import leakage_from_rest, t1_from_rest
+from twin.figures.key_figures import FIGURES, Unit, figures, table
 from twin.figures.settings import FigureSettings, Limits, limits
-from twin.figures.table import FIGURES, Unit, figures, table
 from twin.figures.text import limit_of
 from twin.figures.warnings import CAUTIONS, in_words, warnings
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES

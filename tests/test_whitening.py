@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from twin.inference.covariance import (
+from twin.inference.whitening import (
     CoupledCovariance,
     Covariance,
     add_independent,

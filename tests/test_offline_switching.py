@@ -14,7 +14,7 @@ from second_world.records import record
 
 from twin.calibration.cycles import Cycles
 from twin.monitor.breakpoints import Noise, beside_parabolas
-from twin.monitor.nozzle import Switching, noise_of, switchings
+from twin.monitor.offline_switching import Switching, noise_of, switchings
 from twin.signals import MBAR, SAMPLE, Command, Phase, Quality, Samples
 
 Floats = npt.NDArray[np.float64]

@@ -16,7 +16,7 @@ from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.detector_window import LONGEST_WINDOW, as_wide_as_needed, expected_knees, knees_of
-from twin.monitor.phase_detector import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
+from twin.monitor.switching_detector import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
 from twin.signals import (
     BREAK,
     MBAR,
