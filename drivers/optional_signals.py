@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.tags import Flowmeter, Quantity, Thermometer
-from twin.signals import UNUSABLE, Command, Reported, Samples
+from twin.quality import UNUSABLE
+from twin.signals import Command, Reported, Samples
 
 BITS = {"nozzle": 2, "air_saving": 3, "part_present": 4}  # in the status of a record
 SLOW, FAST = ("ambient", "temperature"), ("pressure_2", "flow")

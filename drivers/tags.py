@@ -12,21 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
+from twin.quality import UNUSABLE, Flags, Quality, mark
 from twin.settings import Settings
-from twin.signals import (
-    PASCAL,
-    SL_MIN,
-    UNUSABLE,
-    ZERO_C,
-    Quality,
-    Reference,
-    Unit,
-    counted_from,
-)
+from twin.signals import PASCAL, SL_MIN, ZERO_C, Reference, Unit, counted_from
 
 Words = npt.NDArray[np.uint16]
 Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.uint8]
 
 Area = Literal["coil", "discrete", "input", "holding"]
 Type = Literal["bit", "int16", "uint16", "int32", "uint32", "float32"]
@@ -212,7 +203,7 @@ class Quantity(Scaled):
             quality = self._judge(raw, value)
         unreadable = ~np.isfinite(column)
         column[unreadable] = np.nan
-        quality[unreadable] |= Quality.BAD.value
+        mark(quality, unreadable, Quality.BAD)
         return column, quality
 
     def raw_of(self, pressure: float, ambient: float) -> tuple[float, bool]:
@@ -230,10 +221,10 @@ class Quantity(Scaled):
         quality = np.zeros(len(raw), np.uint8)
         if self.range is not None:
             low, high = self.range
-            quality[(value < low) | (value > high)] |= Quality.OUT_OF_RANGE.value
+            mark(quality, (value < low) | (value > high), Quality.OUT_OF_RANGE)
         if self.overflow_above is not None:  # two's complement reaches one further down
             above = self.overflow_above
-            quality[(raw > above) | (raw < -above - 1)] |= Quality.OVERFLOW.value
+            mark(quality, (raw > above) | (raw < -above - 1), Quality.OVERFLOW)
         return quality
 
     def gauge(self, raw: Floats, ambient: float | Floats) -> npt.NDArray[np.float32]:

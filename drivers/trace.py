@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from drivers.reconnect import EMPTY, Clock, LostError
 from twin.errors import SourceError
+from twin.quality import Quality, mark
 from twin.settings import KeyedError
-from twin.signals import Quality, Samples
+from twin.signals import Samples
 
 COMMANDS = 0b11  # in the status of a record, as in Command
 COMMAND_BITS = {"suction": 0, "blow_off": 1}  # the same by the tags' names
@@ -221,7 +222,7 @@ class Follower(ABC, Generic[H, L]):
 
     def _mark_breaks(self, block: Samples) -> None:
         gaps = np.diff(block["sequence"], prepend=self._last) != 1
-        block["quality"][gaps] |= Quality.GAP.value
+        mark(block["quality"], gaps, Quality.GAP)
         if block["time_ns"][0] <= self._last_ns:
             self._break |= Quality.CLOCK
         block["quality"][0] |= self._break

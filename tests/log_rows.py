@@ -5,7 +5,8 @@ import numpy as np
 from twin.events import Event, Kind
 from twin.log.header import LogHeader
 from twin.log.reader import Log
-from twin.signals import SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
 
 START_NS = 1_760_000_000_000_000_000
 HEADER = LogHeader(

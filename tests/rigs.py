@@ -19,8 +19,9 @@ from twin.monitor.detector_window import expected_knees
 from twin.monitor.isolation import Isolation
 from twin.monitor.monitor import Monitor
 from twin.monitor.switching_detector import Knees
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import MBAR, Quality, Samples, Ticks
+from twin.signals import MBAR, Samples, Ticks
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("test_rig", "gripper")

@@ -27,8 +27,9 @@ from twin.events import Event, Kind
 from twin.figures.cycle import KeyFigures
 from twin.live import run
 from twin.monitor.monitor import Monitor
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import SAMPLE, Samples
 
 UNIT = Unit("compact-ejector-35", "gripper-01")
 S = 1_000_000_000

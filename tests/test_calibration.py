@@ -29,7 +29,8 @@ from twin.model.theta import Theta
 from twin.monitor.bins import warped
 from twin.monitor.cycles import PAPER_VACUUM, CycleCutter, time_to_vacuum
 from twin.monitor.monitor import Monitor
-from twin.signals import MBAR, Phase, Quality, Samples
+from twin.quality import Quality
+from twin.signals import MBAR, Phase, Samples
 
 HELD_OUT = (21, 22, 23)
 DRAWN = (0, 1, 2, 3)  # of the rigs that tools/calibration_coverage.py draws

@@ -14,7 +14,8 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.clock import EVERY, WINDOW_NS, ClockWatch, line, slope_pm
 from twin.monitor.monitor import Monitor, MonitorSettings
-from twin.signals import SAMPLE, TICK, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, TICK, Samples
 
 S, MS = 1_000_000_000, 1_000_000
 START_NS = 1_790_000_000 * S

@@ -55,7 +55,8 @@ from twin.errors import ConfigError
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients, sensor_place
-from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples, bridged
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, bridged
 
 CYCLES = 9
 

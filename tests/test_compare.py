@@ -28,7 +28,8 @@ from twin.live import run as run_loop
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.signals import MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 LEAK = "leakage=2.0@0"
 

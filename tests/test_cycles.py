@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from twin.model import theta as c
 from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, figures, whole
-from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 AMBIENT = 1e5
 THETA = rigs.theta("test_rig")

@@ -11,7 +11,8 @@ import rigs
 from second_world import draw_rig, record
 
 from twin.errors import ConfigError, SourceError
-from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
+from twin.quality import Quality
+from twin.signals import MBAR, SAMPLE, Command, Samples
 from twin.tables.derive import derive
 from twin.tables.reader import open_table
 from twin.tables.settings import ImportSettings

@@ -34,8 +34,9 @@ from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.monitor.cycles import PAPER_VACUUM
 from twin.monitor.switching_detector import Knees
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import MBAR, NS, Command, Phase, Quality, Samples
+from twin.signals import MBAR, NS, Command, Phase, Samples
 
 ROOT = Path(__file__).parent.parent
 DOCUMENT = Document.read(ROOT / "configs" / "test_rig.toml")

@@ -13,7 +13,8 @@ from drivers.plc.live import WITNESSED
 from tools import fault_run
 from twin.events import Event, Kind
 from twin.log.recorder import Recorder
-from twin.signals import MBAR, TICK, Quality, Samples
+from twin.quality import Quality
+from twin.signals import MBAR, TICK, Samples
 
 
 def test_after_every_disturbance_the_log_is_true_and_the_twin_right(

@@ -13,7 +13,8 @@ from twin.compare.compare import chance
 from twin.figures.curve import CURVE, Reading, Stretch, flow_behind, readings, stretches
 from twin.figures.cycle import KeyFigures
 from twin.monitor.cycles import cut
-from twin.signals import MBAR, ML, SL_MIN, Command, Quality, Samples
+from twin.quality import Quality
+from twin.signals import MBAR, ML, SL_MIN, Command, Samples
 
 # Levels (mbar) with time constant and length (s): idle, an open cup, a part, a slow leak, a vent.
 PARTS = (

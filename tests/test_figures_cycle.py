@@ -26,19 +26,8 @@ from twin.model.term import Term
 from twin.monitor.cycles import LONGEST_PIECE, CycleCutter
 from twin.monitor.cycles import figures as old_figures
 from twin.monitor.monitor import Monitor
-from twin.signals import (
-    BREAK,
-    MBAR,
-    ML,
-    SAMPLE,
-    SL_MIN,
-    TICK,
-    Command,
-    Phase,
-    Quality,
-    Samples,
-    Ticks,
-)
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, ML, SAMPLE, SL_MIN, TICK, Command, Phase, Samples, Ticks
 
 GAS, KELVIN = 287.05, 293.15
 ROOM = {"test_rig": 755 * ML, "gripper": 150 * ML}

@@ -38,8 +38,9 @@ from twin.hil import LONGEST_GAP_S, Plant, in_place
 from twin.log.reader import open_log
 from twin.model import kernel
 from twin.model import theta as c
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import MBAR, Command, Quality, Samples, Signal
+from twin.signals import MBAR, Command, Samples, Signal
 
 PATIENCE_S = 60.0
 MODBUS, OPCUA = re.findall(r"```toml\n(.*?)```", (rigs.ROOT / "docs/hil.md").read_text(), re.DOTALL)

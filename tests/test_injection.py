@@ -40,7 +40,8 @@ from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.staleness import Listening, Notices
 from twin.page.ring import LiveRows
-from twin.signals import SAMPLE, TICK, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 from twin.supervised import Outages, SupervisedSink
 
 ROWS, BLOCK = 600, 30

@@ -26,7 +26,8 @@ from test_webhook import At, Server
 
 from drivers.modbus.source import blocks
 from twin.notifications import sender
-from twin.signals import SAMPLE, UNUSABLE, Samples
+from twin.quality import UNUSABLE
+from twin.signals import SAMPLE, Samples
 
 CALLS = ("connect", "sendall", "send", "recv", "recv_into", "setsockopt", "settimeout")
 ERRORS = (errno.ECONNRESET, errno.EHOSTUNREACH, errno.ENOBUFS)

@@ -15,7 +15,8 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.gas import GAMMA
 from twin.model.theta import Theta
-from twin.signals import BREAK, MBAR, MS, SAMPLE, Command, Phase, Quality, Samples
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 Rows = npt.NDArray[np.float64]
 IDLE, SUCTION, HOLD, BLOW_OFF = Phase

@@ -21,7 +21,8 @@ from twin.log.header import LogHeader
 from twin.log.reader import Log, open_log
 from twin.log.recorder import Recorder
 from twin.monitor.staleness import Listening
-from twin.signals import SAMPLE, Command, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import SAMPLE, Command, Phase, Samples, Ticks
 
 EMPTY = np.empty(0, SAMPLE)
 

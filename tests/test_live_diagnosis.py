@@ -24,7 +24,8 @@ from twin.events import Event, Kind, Severity
 from twin.live import run
 from twin.log.check import check
 from twin.log.reader import open_log
-from twin.signals import SAMPLE, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, Samples
 
 GRIPPER = rigs.path_of("gripper")
 LOWEST = 19  # priority that there is

@@ -18,7 +18,7 @@ from twin.errors import SourceError
 from twin.log.check import Report, check, recover
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.signals import Quality
+from twin.quality import Quality
 
 SAMPLES, TICKS = course(2000)
 BLOCK = 250

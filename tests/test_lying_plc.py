@@ -29,7 +29,8 @@ from twin.live import run
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.staleness import Listening, Notices
-from twin.signals import BREAK, SAMPLE, UNUSABLE, Quality, Samples
+from twin.quality import BREAK, UNUSABLE, Quality
+from twin.signals import SAMPLE, Samples
 
 BLOCKS = 400  # with lies, and half as many after them
 SHARE = 0.05  # of the answers that are lies

@@ -19,8 +19,9 @@ from tests.modbus_server import CUT, HALF, SILENT, ModbusServer, PlcTime, TraceP
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Kind
 from twin.monitor.clock import ClockWatch
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import SAMPLE, Samples
 
 TAGS = {
     "pressure": {

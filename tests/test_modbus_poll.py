@@ -18,7 +18,8 @@ from drivers.reconnect import Clock, LostError
 from drivers.tags import Tag
 from tests.modbus_server import CUT, ModbusServer, PlcTime
 from twin.errors import SourceError
-from twin.signals import SAMPLE, Command, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, Command, Samples
 
 TAGS: dict[str, Any] = {
     "pressure": {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"},

@@ -13,7 +13,8 @@ from twin.model.effects import EFFECTS, UNKNOWN
 from twin.monitor import naming
 from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.monitor import Monitor, MonitorSettings
-from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Samples, Ticks
 
 STREAM = (
     Kind.GAP,

@@ -10,7 +10,8 @@ from twin.model.theta import Theta
 from twin.monitor import naming
 from twin.monitor.naming import likenesses
 from twin.monitor.rows import drawn_rows, time_steps
-from twin.signals import Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import Samples, Ticks
 
 BEGIN = 3600  # rows that let the models swing in
 

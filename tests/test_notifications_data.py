@@ -21,7 +21,8 @@ from twin.notifications.mqtt import Mqtt
 from twin.notifications.outbox import Outbox, open_outbox
 from twin.notifications.sender import HOUR_NS, Lane, Sender, box_of
 from twin.notifications.settings import MqttSettings, Outlet
-from twin.signals import MBAR, UNUSABLE, Phase, Quality
+from twin.quality import UNUSABLE, Quality
+from twin.signals import MBAR, Phase
 
 ASSET = {"type": UNIT.type, "id": UNIT.id, "batch": "2026-07"}
 AMBIENT = 101_300.0

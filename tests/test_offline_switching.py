@@ -15,7 +15,8 @@ from second_world.records import record
 from twin.calibration.cycles import Cycles
 from twin.monitor.breakpoints import Noise, beside_parabolas
 from twin.monitor.offline_switching import Switching, noise_of, switchings
-from twin.signals import MBAR, SAMPLE, Command, Phase, Quality, Samples
+from twin.quality import Quality
+from twin.signals import MBAR, SAMPLE, Command, Phase, Samples
 
 Floats = npt.NDArray[np.float64]
 IDLE_MS, SUCTION_MS, CYCLES = 300, 1500, 4

@@ -18,7 +18,8 @@ from drivers.reconnect import AbsentError, Away, Clock, LostError, reconnecting
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.monitor.clock import ClockWatch
-from twin.signals import SAMPLE, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, Samples
 
 T = ua.VariantType
 DEPTH = 1024

@@ -17,7 +17,8 @@ from test_opcua_subscribe import FakeLink, change, granted, publication, subscri
 from drivers.opcua.bounds import refuse_endless_arrays
 from drivers.reconnect import EMPTY, LostError
 from twin.errors import SourceError
-from twin.signals import BREAK, UNUSABLE, Quality, Samples
+from twin.quality import BREAK, UNUSABLE, Quality
+from twin.signals import Samples
 
 NODES = ("Sequence", "Time", "Boot", "Period", "Sequences", "Statuses", "Pressures")
 ODD = [float("nan"), float("inf"), -1e300]

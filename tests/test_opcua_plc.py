@@ -23,8 +23,9 @@ from drivers.opcua.source import blocks
 from drivers.reconnect import REAL, Clock, LostError
 from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import SAMPLE, Quality, Samples
+from twin.signals import SAMPLE, Samples
 from twin.users import Role
 
 SUBSCRIBE = {"mode": "subscribe", "interval_ms": 50, "sampling_ms": 5}

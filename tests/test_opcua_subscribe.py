@@ -17,7 +17,8 @@ from drivers.opcua.subscribe import Subscription
 from drivers.opcua.values import EPOCH
 from drivers.reconnect import Clock, LostError
 from twin.errors import SourceError
-from twin.signals import SAMPLE, Command, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, Command, Samples
 
 T = ua.VariantType
 PRESSURE, SUCTION, BLOW_OFF = range(3)

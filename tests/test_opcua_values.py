@@ -18,7 +18,7 @@ from drivers.opcua.client import OpcuaClient
 from drivers.opcua.settings import Node, OpcuaSettings
 from drivers.reconnect import REAL, LostError
 from twin.errors import SourceError
-from twin.signals import Quality
+from twin.quality import Quality
 
 NODE = Node("s=Meas.Pressure")
 S = ua.StatusCodes

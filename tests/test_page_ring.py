@@ -12,7 +12,8 @@ from page_site import AMBIENT, NOW, S, flat
 from twin.errors import SourceError
 from twin.page import ring
 from twin.page.ring import DEPTH, FILE, ROW_NS, LiveRows, read
-from twin.signals import SAMPLE, TICK, Command, Phase, Quality
+from twin.quality import Quality
+from twin.signals import SAMPLE, TICK, Command, Phase
 
 PER_ROW = ROW_NS // 1_000_000  # samples
 

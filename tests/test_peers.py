@@ -35,7 +35,8 @@ from drivers.opcua import source as opcua
 from drivers.opcua.settings import OpcuaSettings
 from drivers.reconnect import LostError
 from twin.errors import ConfigError, SourceError
-from twin.signals import SAMPLE, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, Samples
 
 LONGEST_RUN = 40_000  # scans that a PLC makes before its test is over
 PLC = "plc"  # the name in the certificate of the PLC behind TLS

@@ -27,8 +27,9 @@ from drivers.plc.scan import OVERFLOW, PERIOD_NS
 from drivers.reconnect import Clock
 from drivers.tags import Address
 from tests.structured_text import Block, iec, parsed
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import MBAR, SAMPLE, Command, Quality, Reported, Samples
+from twin.signals import MBAR, SAMPLE, Command, Reported, Samples
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "connect-your-plc.md").read_text(encoding="utf-8")

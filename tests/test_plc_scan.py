@@ -9,7 +9,8 @@ from drivers.plc.faults import parse_fault
 from drivers.plc.scan import DEPTH, PERIOD_NS, Task
 from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import EPOCH_NS, blocks, to_samples
-from twin.signals import MBAR, SAMPLE, Command, Quality
+from twin.quality import Quality
+from twin.signals import MBAR, SAMPLE, Command
 
 FAST = PlcSettings.model_validate(
     {

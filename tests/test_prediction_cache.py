@@ -12,7 +12,8 @@ from twin.model import kernel
 from twin.monitor.cycles import LONGEST_PIECE, Cycle, CycleCutter, cut
 from twin.monitor.model_bank import SUSPECTS, SWUNG_IN, ModelBank
 from twin.monitor.prediction_cache import KEPT, LONGER_MS, CachedPrediction, PredictionCache
-from twin.signals import MBAR, MS, NS, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import MBAR, MS, NS, Phase, Samples, Ticks
 
 Floats = npt.NDArray[np.float64]
 SECONDS = {"test_rig": 100.0, "gripper": 60.0}

@@ -34,8 +34,9 @@ from drivers.sources import open_source
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
 from twin.live import run
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.signals import SAMPLE, TICK, Phase, Samples, Ticks
 from twin.users import Role
 
 NAMESPACE = "urn:ejector-twin:results"

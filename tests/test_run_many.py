@@ -31,8 +31,8 @@ from drivers.tags import Address
 from twin.errors import SourceError
 from twin.events import Kind
 from twin.log.reader import Log, open_log
+from twin.quality import BREAK
 from twin.run_many import run_together
-from twin.signals import BREAK
 
 PATIENCE_S = 40.0
 TAGS = {

@@ -18,7 +18,8 @@ from twin.events import Event, Kind, Severity
 from twin.live import run
 from twin.monitor.monitor import Monitor
 from twin.monitor.staleness import Listening
-from twin.signals import SAMPLE, Command, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import SAMPLE, Command, Samples, Ticks
 
 EMPTY = np.empty(0, SAMPLE)
 S, MS = 1_000_000_000, 1_000_000

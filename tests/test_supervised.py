@@ -18,7 +18,8 @@ from twin.events import Event, Kind
 from twin.log.reader import open_log
 from twin.log.recorder import ROOM, Recorder
 from twin.monitor.staleness import Notices
-from twin.signals import Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import Samples, Ticks
 from twin.supervised import KEPT_ROWS, Outages, SupervisedEnricher, SupervisedSink
 
 

@@ -17,17 +17,8 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.detector_window import LONGEST_WINDOW, as_wide_as_needed, expected_knees, knees_of
 from twin.monitor.switching_detector import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
-from twin.signals import (
-    BREAK,
-    MBAR,
-    MS,
-    SAMPLE,
-    Command,
-    Phase,
-    Quality,
-    Samples,
-    sampling_ms,
-)
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, sampling_ms
 
 NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
 SECONDS = 24.0

@@ -8,8 +8,9 @@ import pytest
 from table_rows import AMBIENT, MARK, REFUSE, SMALL, taken, written
 
 from twin.errors import ConfigError, SourceError, TwinError
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import Command, Quality, Reported
+from twin.signals import Command, Reported
 from twin.tables import csv_file
 from twin.tables.reader import open_table
 from twin.tables.settings import ImportSettings

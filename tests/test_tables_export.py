@@ -18,7 +18,8 @@ from twin.errors import ConfigError, SourceError
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
-from twin.signals import TICK, Quality, Reported, Samples, Signal, Ticks
+from twin.quality import Quality
+from twin.signals import TICK, Reported, Samples, Signal, Ticks
 from twin.tables import parquet_file
 from twin.tables.export import export
 from twin.tables.reader import open_table

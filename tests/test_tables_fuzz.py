@@ -15,7 +15,8 @@ from openpyxl import Workbook
 from table_rows import MARK, REFUSE, taken, written
 
 from twin.errors import SourceError, TwinError
-from twin.signals import SAMPLE, TICK, Quality, Samples
+from twin.quality import Quality
+from twin.signals import SAMPLE, TICK, Samples
 from twin.tables import csv_file
 from twin.tables.export import export
 from twin.tables.settings import ImportSettings

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from drivers.tags import Address, Pressure, Tag
 from twin.errors import ConfigError
+from twin.quality import Quality
 from twin.settings import Document
-from twin.signals import PASCAL, Quality
+from twin.signals import PASCAL
 
 AMBIENT = 101_325.0
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}

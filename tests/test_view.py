@@ -16,7 +16,8 @@ import pytest
 
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
-from twin.signals import MBAR, SAMPLE, TICK, Command, Phase, Quality, Samples, Ticks
+from twin.quality import Quality
+from twin.signals import MBAR, SAMPLE, TICK, Command, Phase, Samples, Ticks
 from twin.view import TIMELINE, Screen, View
 
 AMBIENT = 100_000.0

@@ -14,7 +14,8 @@ from independent import simulated
 from opcua_plc import OpcuaPlc, start_opcua
 from test_peers import blocks, by_modbus
 
-from twin.signals import BREAK, SAMPLE, Samples
+from twin.quality import BREAK
+from twin.signals import SAMPLE, Samples
 
 Frame = Callable[[socket.socket], bytes]  # the next whole message; b"" at the end
 

@@ -43,7 +43,8 @@ from twin.events import Event, Kind
 from twin.log.part import SUFFIX, first_parts
 from twin.log.reader import Log, open_log
 from twin.log.records import is_complete
-from twin.signals import BREAK, MBAR, SAMPLE, TICK, Phase, Quality, Samples, Ticks
+from twin.quality import BREAK, Quality
+from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modbus": "test_rig", "opcua": "test_rig_opcua"}

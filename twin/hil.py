@@ -15,7 +15,8 @@ from twin.model import theta as c
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.rows import elapsed
-from twin.signals import BREAK, Samples, Signal
+from twin.quality import BREAK
+from twin.signals import Samples, Signal
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]

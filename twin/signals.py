@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from twin.quality import NEW_TIME, UNUSABLE, Quality
+
 # Units at the edges. Inside everything is SI and pressures are absolute.
 MBAR = 100.0  # Pa
 BAR = 1e5  # Pa
@@ -121,24 +123,7 @@ class Reported(IntFlag):
     FLOW_KNOWN = 16
 
 
-class Quality(IntFlag):
-    """Faults of a sample, or of the stream just before it; 0 is good."""
-
-    GAP = 1  # samples are missing before this one
-    RESTART = 2  # the PLC restarted before this one
-    CLOCK = 4  # PLC time jumped before this one
-    OUT_OF_RANGE = 8  # outside the range the tag declares
-    OVERFLOW = 16  # the input is beyond what it can measure: not a pressure
-    STALE = 32  # the PLC answers, but its value is no longer fresh
-    BAD = 64  # the PLC or the server marks the value as bad
-    OURS = 128  # the twin caused the pause before its receipt: it was late, or its clock was set
-
-
-# Plain numbers: with an IntFlag NumPy would convert every byte to 64 bits.
-UNUSABLE = int(Quality.OVERFLOW | Quality.STALE | Quality.BAD)  # no pressure to compare with
-BREAK = int(Quality.GAP | Quality.RESTART | Quality.CLOCK)  # time does not run on from before
 MOST_BRIDGED = 3  # consecutive missing rows that the model steps over
-NEW_TIME = int(Quality.RESTART | Quality.CLOCK)  # another PLC time begins, earlier or later
 
 
 def unseen_ns(before: Samples | np.void, after: Samples | np.void) -> npt.NDArray[np.int64]:

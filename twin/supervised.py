@@ -16,7 +16,8 @@ from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
 from twin.live import EventEnricher, Sink
 from twin.monitor.staleness import Notices
-from twin.signals import TICK, Quality, Samples, Ticks
+from twin.quality import Quality, mark
+from twin.signals import TICK, Samples, Ticks
 
 KEPT_ROWS = 60_000  # rows that wait for an output: one minute at 1 kHz, about 5 MB
 KEPT_EVENTS = 10_000  # events of lost rows
@@ -108,7 +109,7 @@ class Backlog:
     def _mark(self) -> None:
         first_rows = next((rows for rows, *_ in self.blocks if len(rows)), None)
         if self._gap and first_rows is not None:
-            first_rows["quality"][0] |= np.uint8(Quality.GAP)
+            mark(first_rows["quality"], [0], Quality.GAP)
             self._gap = False
 
 

@@ -29,18 +29,8 @@ from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind, Severity
 from twin.extras import install_hint, require
 from twin.model.effects import EFFECTS, UNKNOWN
-from twin.signals import (
-    BREAK,
-    MBAR,
-    SAMPLE,
-    TICK,
-    UNUSABLE,
-    Command,
-    Phase,
-    Samples,
-    Ticks,
-    deviation,
-)
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MBAR, SAMPLE, TICK, Command, Phase, Samples, Ticks, deviation
 
 TIMELINE = "PLC time of the sample"  # as long as a time: it sets the width of the list's column
 # PLC time sent to Rerun at once: a row costs 8 µs in batches of 100 and 2 µs in those of 1000.

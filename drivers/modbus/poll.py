@@ -14,9 +14,9 @@ from drivers.modbus.plan import Answers, Request, holds, plan
 from drivers.modbus.settings import ModbusSettings
 from drivers.optional_signals import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.reconnect import Clock, Connection
-from drivers.tags import Flags
 from twin.errors import SourceError
-from twin.signals import MBAR, SAMPLE, Command, Quality, Samples
+from twin.quality import Flags, Quality, flags_where
+from twin.signals import MBAR, SAMPLE, Command, Samples
 
 SLOT_NS = 1_000_000
 SPIN_NS = 60_000  # a sleeping thread wakes about this late; longer spinning won nothing
@@ -129,7 +129,7 @@ class Poller:
     def _gaps(self, slots: npt.NDArray[np.int64]) -> Flags:
         missing = np.diff(slots, prepend=slots[0] - 1 if self._last < 0 else self._last) - 1
         self._last = int(slots[-1])
-        return np.where(missing > self._settings.gap_ms, Quality.GAP.value, 0).astype(np.uint8)
+        return flags_where(missing > self._settings.gap_ms, Quality.GAP)
 
     def _stale(self, beats: npt.NDArray[np.generic], at_ns: npt.NDArray[np.int64]) -> Flags:
         """Flags for samples that were read while the heartbeat had been at rest for too long."""
@@ -138,4 +138,4 @@ class Poller:
         changed[0] |= self._beat is None
         changed_ns = np.maximum.accumulate(np.where(changed, at_ns, self._beat_ns))
         self._beat, self._beat_ns = beats[-1], int(changed_ns[-1])
-        return np.where(at_ns - changed_ns > HEARTBEAT_NS, Quality.STALE.value, 0).astype(np.uint8)
+        return flags_where(at_ns - changed_ns > HEARTBEAT_NS, Quality.STALE)

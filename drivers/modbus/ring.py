@@ -18,7 +18,8 @@ from drivers.tags import WordOrder, Words, numbers
 from drivers.trace import COMMANDS, OVERFLOW_BIT, RESERVE, WRAP, Follower, refusal
 from drivers.trace import Header as AnyHeader
 from twin.errors import SourceError
-from twin.signals import MBAR, SAMPLE, Quality, Samples
+from twin.quality import Quality, flags_where
+from twin.signals import MBAR, SAMPLE, Samples
 
 HEADER_WORDS = 12
 RECORD_WORDS = 4
@@ -199,7 +200,7 @@ class Trace(Follower[Header, ModbusClient]):
         ambient = ambient_of(block, tags, raw, fixed)
         put_values(block, tags, raw, ambient)
         block["pressure"], quality = tags.pressure.decode(records[:, 2:4], order, ambient)
-        overflow = ((status >> OVERFLOW_BIT) & 1).astype(np.uint8) * Quality.OVERFLOW.value
+        overflow = flags_where((status >> OVERFLOW_BIT & 1) != 0, Quality.OVERFLOW)
         block["quality"] = quality | overflow
         block["supply"] = np.nan
         if tags.supply is not None:

@@ -27,7 +27,8 @@ from drivers.opcua.values import (
 from drivers.optional_signals import BITS, VALUES, ambient_of, put_bits, put_values
 from drivers.reconnect import EMPTY, Clock, LostError
 from twin.errors import SourceError
-from twin.signals import MBAR, SAMPLE, UNUSABLE, Command, Quality, Samples
+from twin.quality import UNUSABLE, Quality, flags_where, mark
+from twin.signals import MBAR, SAMPLE, Command, Samples
 
 QUEUE_MS = 2000.0  # of samples that the server is asked to keep for us
 PRESSURE = 0  # its index among the nodes, and so its handle
@@ -179,7 +180,7 @@ class Subscription:
         for name, command in (("suction", Command.SUCTION), ("blow_off", Command.BLOW_OFF)):
             on, flags = self._columns[self._index[name]].at(times)
             block["commands"] |= np.where(on == 1, np.uint8(command), np.uint8(0))
-            block["quality"] |= flags | np.where(np.isnan(on), Quality.BAD, 0).astype(np.uint8)
+            block["quality"] |= flags | flags_where(np.isnan(on), Quality.BAD)
         block["supply"] = np.nan
         if tags.supply is not None:
             block["supply"] = tags.supply.gauge(self._usable("supply", times), fixed)
@@ -205,8 +206,8 @@ class Subscription:
         steps = np.maximum(np.rint(steps_ns / self._period_ns).astype(np.int64), 1)
         missing = (steps > 1) & (steps_ns - self._period_ns > self._settings.gap_ms * 1e6)
         block["sequence"] = self._sequence + np.cumsum(steps)
-        block["quality"][missing | lost] |= Quality.GAP.value
-        block["quality"][steps_ns <= 0] |= Quality.CLOCK.value
+        mark(block["quality"], missing | lost, Quality.GAP)
+        mark(block["quality"], steps_ns <= 0, Quality.CLOCK)
         block["quality"][0] |= self._break
         self._break = 0
         self._sequence, self._last_ns = int(block["sequence"][-1]), int(times[-1])

@@ -38,7 +38,8 @@ from drivers.trace import (
     refusal,
 )
 from twin.errors import SourceError
-from twin.signals import MBAR, SAMPLE, UNUSABLE, Quality, Samples
+from twin.quality import UNUSABLE, Quality, flags_where
+from twin.signals import MBAR, SAMPLE, Samples
 
 TRIES = 3  # for a ring that is not torn
 Floats = npt.NDArray[np.float64]
@@ -214,7 +215,7 @@ class NodeTrace(Follower[Header, OpcuaClient]):
         ambient = ambient_of(block, tags, raw, fixed)
         put_values(block, tags, raw, ambient)
         block["pressure"], flags = tags.pressure.pressure(ring.pressures[slots], ambient)
-        overflow = (status >> OVERFLOW_BIT & 1).astype(np.uint8) * Quality.OVERFLOW.value
+        overflow = flags_where((status >> OVERFLOW_BIT & 1) != 0, Quality.OVERFLOW)
         block["quality"] = flags | overflow | np.uint8(ring.quality)
         block["supply"] = np.nan
         if tags.supply is not None:

@@ -11,7 +11,7 @@ from drivers.opcua.settings import Node
 from drivers.reconnect import AbsentError
 from drivers.trace import LATEST_NS
 from twin.errors import SourceError
-from twin.signals import Quality
+from twin.quality import Quality
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from twin.events import Event, Kind
-from twin.signals import MBAR, UNUSABLE, Phase, Quality, Samples, Ticks, deviation
+from twin.quality import UNUSABLE, Quality
+from twin.signals import MBAR, Phase, Samples, Ticks, deviation
 
 STALE_S = 1.0  # after that time without a row the newest is stale, whatever the reason
 KEPT = 16  # events

@@ -8,7 +8,8 @@ from drivers.plc.faults import Fault
 from drivers.plc.plant import Record
 from drivers.plc.scan import OVERFLOW, PERIOD_NS, REPORTED, Scans, Task
 from drivers.plc.settings import PlcSettings, Reports
-from twin.signals import MBAR, SAMPLE, SL_MIN, ZERO_C, Quality, Reported, Samples
+from twin.quality import Quality, flags_where
+from twin.signals import MBAR, SAMPLE, SL_MIN, ZERO_C, Reported, Samples
 
 NOTHING = Reports()
 EPOCH_NS = 1_767_225_600_000_000_000  # 2026-01-01, PLC time of sequence 0
@@ -53,7 +54,7 @@ def to_samples(scans: Scans, reports: Reports = NOTHING) -> Samples:
     samples["pressure"] = scans["pressure"].astype(np.float64) * MBAR
     samples["supply"] = scans["supply"].astype(np.float64) * MBAR
     samples["commands"] = scans["status"] & 3
-    samples["quality"] = np.where(scans["status"] & OVERFLOW, Quality.OVERFLOW, 0)
+    samples["quality"] = flags_where(scans["status"] & OVERFLOW != 0, Quality.OVERFLOW)
     if reports.bits:
         nozzle, part = scans["status"] >> REPORTED & 1, scans["status"] >> REPORTED + 2 & 1
         samples["reported"] = Reported.NOZZLE_KNOWN | Reported.PART_KNOWN

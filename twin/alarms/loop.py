@@ -19,7 +19,8 @@ from twin.alarms.watch import STREAM, deviating, evidence, values
 from twin.errors import TwinError
 from twin.events import Event, Kind
 from twin.model.effects import UNKNOWN
-from twin.signals import Quality, Samples
+from twin.quality import Quality
+from twin.signals import Samples
 
 # After so many complete cycles without a deviation, one that stood before a restart is over. The
 # first cycles may not have been judged.

@@ -25,7 +25,8 @@ from twin.monitor.detector_window import as_wide_as_needed
 from twin.monitor.healthy import Healthy, Scatter, sure
 from twin.monitor.signal_checks import Contradiction, standing
 from twin.monitor.surroundings import taken_in
-from twin.signals import BREAK, MBAR, SAMPLE, UNUSABLE, Command, Phase, Samples, bridged
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MBAR, SAMPLE, Command, Phase, Samples, bridged
 
 FEWEST = 5  # complete cycles
 MOST_FITTED = 12  # cycles that are fitted; the others only show the scatter

@@ -17,7 +17,8 @@ from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.offline_switching import Switching, noise_of, switchings
 from twin.monitor.rows import time_steps
 from twin.monitor.switching_detector import PhaseFinder, commanded
-from twin.signals import MBAR, MS, UNUSABLE, Phase, Samples
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, MS, Phase, Samples
 
 BINS = 6  # in each unit of warped time
 MOST_EARLY = 15.0 * MS  # s (a row at least), by which the nozzle may be seen early or late

@@ -23,7 +23,8 @@ from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
 from twin.model.system import Tube
-from twin.signals import MBAR, MS, NS, UNUSABLE, Samples
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, MS, NS, Samples
 
 # Tolerances of the rounds. Each round uses breakpoints and weights by the fit of the round before.
 ROUNDS = (1e-2, 1e-2, 1e-3)

@@ -17,7 +17,8 @@ from twin.model.gas import R
 from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at
 from twin.monitor.surroundings import told
-from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Reported, Samples
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, MS, NS, Command, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from twin.calibration.readings import Floats, Readings, stretches
 from twin.errors import ConfigError
-from twin.signals import MBAR, UNUSABLE, Samples
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, Samples
 
 NEVER_OPENED = 0.2  # of ambient pressure: a record below it was never at ambient
 TWICE = 1.5  # of ambient pressure: an idle above it counts ambient pressure twice

@@ -19,7 +19,8 @@ from twin.model.dataset import coefficients
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle, cut
 from twin.monitor.cycles import figures as judged
-from twin.signals import BREAK, MBAR, MS, NS, UNUSABLE, Phase, Samples, Ticks, deviation, unbroken
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MBAR, MS, NS, Phase, Samples, Ticks, deviation, unbroken
 
 Floats = npt.NDArray[np.float64]
 

@@ -39,15 +39,14 @@ from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import medians_of, surrounded
 from twin.monitor.switching_detector import Knees
 from twin.monitor.uncertain_data import shifted
+from twin.quality import UNUSABLE, Quality
 from twin.signals import (
     MBAR,
     NS,
     SAMPLE,
     TICK,
-    UNUSABLE,
     Command,
     Phase,
-    Quality,
     Samples,
     Ticks,
     bridged,

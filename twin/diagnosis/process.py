@@ -25,7 +25,8 @@ from twin.errors import in_words
 from twin.events import Event, Kind
 from twin.instants import SECOND_NS
 from twin.model.effects import effect_of
-from twin.signals import NEW_TIME, SAMPLE, Samples
+from twin.quality import NEW_TIME
+from twin.signals import SAMPLE, Samples
 
 CYCLES = 13  # kept cycles: all are judged but the first, in which the model settles
 MOST_ROWS = 300_000  # kept rows, however long cycles are

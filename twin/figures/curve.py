@@ -18,18 +18,8 @@ from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
 from twin.model.control import LEAK_SETTLE_S
 from twin.model.gas import GAMMA, R
 from twin.model.system import volume
-from twin.signals import (
-    MBAR,
-    ML,
-    NS,
-    SAMPLE,
-    SL_MIN,
-    UNUSABLE,
-    Command,
-    Quality,
-    Samples,
-    joined,
-)
+from twin.quality import UNUSABLE, Quality
+from twin.signals import MBAR, ML, NS, SAMPLE, SL_MIN, Command, Samples, joined
 from twin.tables.derive import shortest_half
 
 Floats = npt.NDArray[np.float64]

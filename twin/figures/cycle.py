@@ -16,17 +16,8 @@ from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle
 from twin.monitor.monitor import MonitorSettings
-from twin.signals import (
-    BREAK,
-    MBAR,
-    MS,
-    SAMPLE,
-    TICK,
-    Phase,
-    Samples,
-    Ticks,
-    joined,
-)
+from twin.quality import BREAK
+from twin.signals import MBAR, MS, SAMPLE, TICK, Phase, Samples, Ticks, joined
 
 _OVER = (Phase.IDLE, Phase.BLOW_OFF)
 _LABELS = {

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from twin.model.compiled import compiled
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S
-from twin.signals import BAR, MBAR, NS, UNUSABLE, Phase, Samples, Ticks
+from twin.quality import UNUSABLE
+from twin.signals import BAR, MBAR, NS, Phase, Samples, Ticks
 
 LEAK_WINDOW_S = 1.0  # after the settling, over which leakage is read
 LEAST_WINDOW_S = 0.05  # noise of 0.3 mbar then gives 3 mbar/s

@@ -20,7 +20,8 @@ from twin.model.term import Terms
 from twin.model.theta import Theta
 from twin.monitor.cycles import STALE
 from twin.monitor.rows import TimeSteps
-from twin.signals import BREAK, MBAR, MS, Command, Phase, Samples, Ticks
+from twin.quality import BREAK
+from twin.signals import MBAR, MS, Command, Phase, Samples, Ticks
 
 LONGEST_SUCTION_S = 60.0  # in which H1 must be reached from rest
 FREE_S = 1.0  # of suction with the cup open, until its vacuum is read

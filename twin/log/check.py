@@ -13,7 +13,8 @@ from twin.log.reader import Log, decode_event_message, decode_rows, open_log
 from twin.log.recorder import Recorder
 from twin.log.records import Damage, messages
 from twin.log.schema import EVENTS, SAMPLES
-from twin.signals import NS, LastRow, Quality, Samples, Ticks, unseen_ns
+from twin.quality import Quality
+from twin.signals import NS, LastRow, Samples, Ticks, unseen_ns
 
 Piece = tuple[Samples, Ticks, list[Event]]
 

@@ -29,7 +29,7 @@ from twin.errors import TwinError
 from twin.files import private_folder, user_cache
 
 DAY_S = 86_400.0
-SHARED = ("signals.py", "cpu_target.py")
+SHARED = ("signals.py", "quality.py", "cpu_target.py")
 _log = logging.getLogger(__name__)
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)

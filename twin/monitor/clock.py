@@ -17,7 +17,8 @@ import numpy.typing as npt
 from twin.events import Event, Kind
 from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
 from twin.model.compiled import compiled
-from twin.signals import NEW_TIME, SAMPLE, LastRow, Samples
+from twin.quality import NEW_TIME
+from twin.signals import SAMPLE, LastRow, Samples
 
 WINDOW_NS = 5_000_000_000  # of PLC time; the fastest receipt of each counts
 KEPT = 120  # windows: ten minutes, over which the drift of a quartz is steady

@@ -12,18 +12,8 @@ import numpy.typing as npt
 from twin.model import theta as c
 from twin.model.compiled import compiled
 from twin.model.theta import Theta
-from twin.signals import (
-    BREAK,
-    MBAR,
-    NS,
-    UNUSABLE,
-    Phase,
-    Quality,
-    Samples,
-    Ticks,
-    deviation,
-    joined,
-)
+from twin.quality import BREAK, UNUSABLE, Quality
+from twin.signals import MBAR, NS, Phase, Samples, Ticks, deviation, joined
 
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin.events import Event, Kind
-from twin.signals import MOST_BRIDGED, NS, Bridge, LastRow, Quality, Samples, unseen_ns
+from twin.quality import Quality, mark
+from twin.signals import MOST_BRIDGED, NS, Bridge, LastRow, Samples, unseen_ns
 
 APART_NS = 1_000_000_000  # between events of short gaps: a stream may have dozens a second
 
@@ -56,7 +57,7 @@ class ShortGaps:
         if marked_rows:
             self._marks = self._marks[len(marked_rows) :]
             samples = samples.copy()
-            samples["quality"][marked_rows] |= np.uint8(Quality.GAP)
+            mark(samples["quality"], marked_rows, Quality.GAP)
             for row in marked_rows:
                 self._report(samples[row - 1] if row else self._last.row[0], samples[row])
         self._last.keep(samples)

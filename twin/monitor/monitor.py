@@ -33,19 +33,9 @@ from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.signal_checks import ReportWatch
 from twin.monitor.surroundings import following
+from twin.quality import BREAK, NEW_TIME, Quality
 from twin.settings import Settings
-from twin.signals import (
-    BREAK,
-    NEW_TIME,
-    NS,
-    SAMPLE,
-    TICK,
-    LastRow,
-    Quality,
-    Samples,
-    Ticks,
-    joined,
-)
+from twin.signals import NS, SAMPLE, TICK, LastRow, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.baseline import Baseline

@@ -30,7 +30,8 @@ from twin.monitor.breakpoints import (
     smoothed,
     stepped,
 )
-from twin.signals import MBAR, MS, NS, UNUSABLE, Phase, Reported, Samples
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, MS, NS, Phase, Reported, Samples
 
 LONGEST_GAP, GAP_ROWS = 20.0 * MS, 5.0  # without a reading; a longer gap splits a suction
 LEAST_VACUUM, LEAST_NOISE, LEAST_ROWS = 20.0 * MBAR, 10.0, 12  # less shows nothing

@@ -4,7 +4,8 @@ import numpy as np
 
 from twin.model.compiled import compiled
 from twin.monitor.bins import Floats, Ints, drawn
-from twin.signals import BREAK, NS, Samples, Ticks
+from twin.quality import BREAK
+from twin.signals import NS, Samples, Ticks
 
 
 class TimeSteps:

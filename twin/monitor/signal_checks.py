@@ -17,7 +17,8 @@ from twin.model.gas import R
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
 from twin.monitor.switching_detector import Knees, PhaseFinder
-from twin.signals import BREAK, MBAR, NS, SL_MIN, UNUSABLE, Command, Phase, Reported, Samples
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MBAR, NS, SL_MIN, Command, Phase, Reported, Samples
 
 PATIENCE = 2  # cycles in a row that must contradict, or agree again
 # Two sensors may differ by so much at rest: 1 % of a vacuum sensor's bar, as the data sheets of

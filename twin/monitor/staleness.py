@@ -15,7 +15,8 @@ import numpy as np
 
 from twin.events import Event, Kind
 from twin.monitor.monitor import Monitor
-from twin.signals import NS, LastRow, Quality, Samples
+from twin.quality import Quality, mark
+from twin.signals import NS, LastRow, Samples
 
 LONGEST_WAIT_NS = 500_000_000  # drivers give a block at least this often: else the host slept
 ONCE_NS = 60_000_000_000  # a twin that is late again within this time does not report it again
@@ -77,7 +78,7 @@ class Listening:
             first = fresh[:1]
             if (block["host_ns"][first] - last["host_ns"] > monitor.stale_ns).any():
                 block = block.copy()
-                block["quality"][first] |= Quality.OURS.value
+                mark(block["quality"], first, Quality.OURS)
             events = self._late(int(last["time_ns"][0]), now_ns, monitor.stale_ns)
         self._last.keep(block[fresh[-1:]])
         self._heard_ns, self._listened_ns = now_ns, 0

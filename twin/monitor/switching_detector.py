@@ -20,7 +20,8 @@ import numpy.typing as npt
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.model.control import effective_commands, new_timer
-from twin.signals import BREAK, MS, NS, SAMPLE, UNUSABLE, Phase, Reported, Samples, joined
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MS, NS, SAMPLE, Phase, Reported, Samples, joined
 
 _Floats = npt.NDArray[np.float64]
 _Bytes = npt.NDArray[np.uint8]

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from twin.events import Event, Kind
 from twin.notifications.message import Asset, Message, beside, iso_time
-from twin.signals import MBAR, UNUSABLE, Phase, Samples, Ticks, joined
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, Phase, Samples, Ticks, joined
 
 CYCLE_FORMAT = "ejector-twin-cycle/1"
 VALUES_FORMAT = "ejector-twin-values/1"

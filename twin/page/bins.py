@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from twin.figures.database import SIDES
 from twin.page.ring import Live
-from twin.signals import BREAK, MBAR, MOST_BRIDGED, NEW_TIME, UNUSABLE, Samples, Ticks
+from twin.quality import BREAK, NEW_TIME, UNUSABLE
+from twin.signals import MBAR, MOST_BRIDGED, Samples, Ticks
 
 BIN = np.dtype(
     [

@@ -45,7 +45,8 @@ from twin.page.ejector_status import (
 )
 from twin.page.limits import limits_document
 from twin.page.settings import REPORTS, RING, PageSettings, folder_of
-from twin.signals import BREAK, MBAR
+from twin.quality import BREAK
+from twin.signals import MBAR
 
 MOST_EPISODES = 500
 MOST_POINTS = 600  # of a trend's cycles

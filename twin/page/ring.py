@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from twin.errors import SourceError, in_words
 from twin.events import Event
-from twin.signals import SAMPLE, TICK, UNUSABLE, Samples, Ticks
+from twin.quality import UNUSABLE
+from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 ROW = np.dtype(
     [

@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from twin.signals import SAMPLE, UNUSABLE, Command, Quality, Reported, Samples
+from twin.quality import UNUSABLE, Quality
+from twin.signals import SAMPLE, Command, Reported, Samples
 from twin.tables.date_time import Calendar
 from twin.tables.layout import BESIDE, COMMANDS, DIGITS, REPORTED, Layout
 from twin.tables.meaning import SUPPLIES

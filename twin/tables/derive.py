@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from twin.errors import SourceError
 from twin.inference.levels import MAD_TO_SIGMA
-from twin.signals import MBAR, MS, NS, UNUSABLE, Command, Quality, Samples
+from twin.quality import UNUSABLE, Quality
+from twin.signals import MBAR, MS, NS, Command, Samples
 
 Floats = npt.NDArray[np.float64]
 

@@ -14,19 +14,8 @@ from pyarrow import csv, parquet
 from twin.errors import SourceError
 from twin.files import refuse_existing, require_ending
 from twin.log.header import LogHeader
-from twin.signals import (
-    BAR,
-    MBAR,
-    SL_MIN,
-    ZERO_C,
-    Command,
-    Phase,
-    Quality,
-    Reported,
-    Samples,
-    Signal,
-    Ticks,
-)
+from twin.quality import Quality
+from twin.signals import BAR, MBAR, SL_MIN, ZERO_C, Command, Phase, Reported, Samples, Signal, Ticks
 
 ROWS = 100_000  # a good block size for export: a Parquet reader takes that many at once
 

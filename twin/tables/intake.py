@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.errors import SourceError
-from twin.signals import BREAK, LastRow, Quality, Samples
+from twin.quality import BREAK, Quality
+from twin.signals import LastRow, Samples
 from twin.tables.date_time import Calendar
 from twin.tables.decode import Batch, Spoilt, decode
 from twin.tables.layout import COMMANDS, DIGITS, REPORTED, Layout

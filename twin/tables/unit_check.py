@@ -11,7 +11,8 @@ from typing import get_args
 import numpy as np
 
 from twin.errors import SourceError
-from twin.signals import MBAR, PASCAL, UNUSABLE, Command, Reference, Samples, Unit, counted_from
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, PASCAL, Command, Reference, Samples, Unit, counted_from
 from twin.tables.layout import Layout
 from twin.tables.meaning import Meaning
 from twin.tables.settings import Column, ImportSettings, toml_string
