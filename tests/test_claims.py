@@ -198,7 +198,7 @@ def test_the_example_that_unpacks_a_column_of_a_log_unpacks_it() -> None:
 
 # --- rig and model: CONTRIBUTING.md, Tests --------------------------------------------------------
 
-VOCABULARY = ("signals", "errors", "settings", "secret", "users", "events", "cpu_target", "extras")
+VOCABULARY = ("signals", "quality", "errors", "settings", "secret", "users", "events", "cpu_target", "extras")
 
 
 def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:

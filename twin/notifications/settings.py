@@ -202,14 +202,14 @@ class NotificationSettings(Settings):
                 " or [[notifications.people]]"
             )
         addresses = [*self.email.recipients, *(person.address for person in self.people)]
-        if several := sorted({one for one in addresses if addresses.count(one) > 1}):
+        if several := sorted({address for address in addresses if addresses.count(address) > 1}):
             raise ValueError(f"{', '.join(several)}: an address is to be written once")
         return self
 
     @property
     def everybody(self) -> tuple[Person, ...]:
         """The people and the recipients, who are told at once and at any time."""
-        recipients = (Person(name=one, address=one) for one in self.email.recipients)
+        recipients = (Person(name=address, address=address) for address in self.email.recipients)
         return (*recipients, *self.people)
 
 
