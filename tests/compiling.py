@@ -11,8 +11,8 @@ from twin.cli.setup import pair_of
 
 def compiled() -> dict[str, int]:
     """For how many kinds of arguments each function is."""
-    found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
-    return {one.py_func.__qualname__: len(one.signatures) for one in found}
+    found = [entry for entry in gc.get_objects() if isinstance(entry, Dispatcher)]
+    return {dispatcher.py_func.__qualname__: len(dispatcher.signatures) for dispatcher in found}
 
 
 def main(name: str) -> None:

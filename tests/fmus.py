@@ -86,7 +86,7 @@ class Stepped:
 
     def __init__(self, path: str, folder: str) -> None:
         described = fmpy.read_model_description(path)
-        self._variables = {one.name: one for one in described.modelVariables}
+        self._variables = {variable.name: variable for variable in described.modelVariables}
         self.said: list[str] = []
         self.version = int(described.fmiVersion[0])
         known = {
@@ -174,5 +174,5 @@ def stepped(fmu: Fmu, count: int = 1) -> Iterator[Sequence[Stepped]]:
         fmpy.extract(path, folder)
         instances = [Stepped(path, folder) for _ in range(count)]
         yield instances
-        for one in instances:
-            one.fmu.freeInstance()
+        for instance in instances:
+            instance.fmu.freeInstance()

@@ -123,9 +123,9 @@ class Relay:
             thread.join()
 
     def cut(self) -> None:
-        for one in self._open:
+        for connection in self._open:
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
         self._open = []
 
     def _accept(self) -> None:
@@ -147,9 +147,9 @@ class Relay:
             while data := source.recv(65536):
                 if not (source is back and self.swallows.is_set()):
                     target.sendall(data)
-        for one in (source, target):
+        for connection in (source, target):
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
         source.close()
 
 

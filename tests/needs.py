@@ -154,8 +154,8 @@ class Programs:
     @cache  # noqa: B019  # there is one for a run
     def _others(self) -> dict[str, str]:
         """All programs on the path that are no need of any test."""
-        needs = {one for need in NEEDS.values() for one in (*need.programs, *need.aliases)}
-        places = [Path(one) for one in reversed(self._before.split(os.pathsep)) if one]
+        needs = {program for need in NEEDS.values() for program in (*need.programs, *need.aliases)}
+        places = [Path(folder) for folder in reversed(self._before.split(os.pathsep)) if folder]
         files = (file for place in places for file in place.glob("*"))
         return {file.name: str(file.absolute()) for file in files if file.name not in needs}
 

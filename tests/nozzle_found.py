@@ -102,7 +102,10 @@ def found_by_new(samples: Samples, _: Record) -> list[Switch]:
     phase = told(samples)
     seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS
     noise = noise_of(samples, phase)
-    return [(float(seconds[one.row]), one.on) for one in switchings(samples, phase, noise)]
+    return [
+        (float(seconds[switching.row]), switching.on)
+        for switching in switchings(samples, phase, noise)
+    ]
 
 
 def found_by_old(samples: Samples, logged: Record) -> list[Switch]:
@@ -157,10 +160,12 @@ def scored(name, logged, finder=found_by_new, late=None) -> Score:  # type: igno
     late, missed = list[Switch](), list[Switch]()
     for at, on, goes_on in true(logged):
         near = [
-            one for one in left if one[1] == on and abs(one[0] - at) < SHOWS_WITHIN + 3 * period
+            switching
+            for switching in left
+            if switching[1] == on and abs(switching[0] - at) < SHOWS_WITHIN + 3 * period
         ]
         if near:
-            best = min(near, key=lambda one: abs(one[0] - at - 2.0 * LIMIT))
+            best = min(near, key=lambda switching: abs(switching[0] - at - 2.0 * LIMIT))
             left.remove(best)
             late.append((best[0] - at, on))
         elif goes_on > max(GOES_ON, GOES_ON_ROWS * period):
@@ -174,11 +179,11 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
         f"{'kind':22} rigs cycles switchings missed false"
         "  late: median  error: 95 %    most  beyond"
     )
-    kinds = dict.fromkeys(one.name.rsplit(" ", 1)[0] for one in scores)
+    kinds = dict.fromkeys(score.name.rsplit(" ", 1)[0] for score in scores)
     for kind in [*kinds, ""]:
-        some = [one for one in scores if one.name.rsplit(" ", 1)[0] == kind or not kind]
-        late = [by for one in some for by, _ in one.late] or [np.nan]
-        errors = np.concatenate([one.errors for one in some])
+        some = [score for score in scores if score.name.rsplit(" ", 1)[0] == kind or not kind]
+        late = [by for score in some for by, _ in score.late] or [np.nan]
+        errors = np.concatenate([score.errors for score in some])
         errors = errors if len(errors) else np.array([np.nan])
         numbers = [
             sum(len(part) for part in parts)
@@ -214,7 +219,7 @@ def main() -> None:
                 f" first {[*one.missed, *one.false][:2]}\n",
             )
     sys.stdout.write("\n".join(table(scores)) + "\n")
-    slowest = max(scores, key=lambda one: one.seconds)
+    slowest = max(scores, key=lambda score: score.seconds)
     sys.stdout.write(f"slowest: {slowest.name}, {slowest.seconds:.1f} s\n")
 
 

@@ -69,7 +69,7 @@ class Block:
         self.types: dict[str, str] = {}
         self.values: dict[str, Any] = {}
         declarations = [item.declaration for item in items if hasattr(item, "declaration")]
-        self._made = {str(one.name): one for one in declarations}
+        self._made = {str(declaration.name): declaration for declaration in declarations}
         self._real_bits = real_bits
         for item in items:
             if isinstance(item, tree.GlobalVariableDeclarations):
@@ -92,10 +92,12 @@ class Block:
         for declared in declarations:
             init = getattr(declared, "init", None)
             spec = init.spec if init else declared.spec  # of a union's member
-            for one in (
+            for variable in (
                 declared.variables if init and hasattr(declared, "variables") else [declared]
             ):
-                name = prefix + str(getattr(one, "variable", getattr(one, "name", one)))
+                name = prefix + str(
+                    getattr(variable, "variable", getattr(variable, "name", variable))
+                )
                 self._add(name, spec, init and init.value)
 
     def _add(self, name: str, spec: Any, start: Any) -> None:
@@ -112,18 +114,18 @@ class Block:
 
     def _statements(self, statements: list[Any], indent: str) -> list[str]:
         lines = []
-        for one in statements:
-            if isinstance(one, tree.IfStatement):
-                assert one.else_clause is None
-                assert not one.else_ifs
-                condition = self._typed(one.if_expression, "BOOL")
-                body = self._statements(one.statements.statements, indent + "    ")
+        for statement in statements:
+            if isinstance(statement, tree.IfStatement):
+                assert statement.else_clause is None
+                assert not statement.else_ifs
+                condition = self._typed(statement.if_expression, "BOOL")
+                body = self._statements(statement.statements.statements, indent + "    ")
                 lines += [f"{indent}if {condition}:", *body]
             else:
-                assert isinstance(one, tree.AssignmentStatement)
-                place, kind = self._place(one.variables[0])
-                value = self._typed(one.expression, kind)
-                if kind == "REAL" and self._of_union(one.variables[0]):
+                assert isinstance(statement, tree.AssignmentStatement)
+                place, kind = self._place(statement.variables[0])
+                value = self._typed(statement.expression, kind)
+                if kind == "REAL" and self._of_union(statement.variables[0]):
                     value = f"to_bits({value})"
                 lines += [f"{indent}{place} = {value}", f"{indent}yield"]
         return lines
@@ -176,7 +178,7 @@ class Block:
         return f"to_width({left} {SYMBOLS[str(node.op)]} {right}, '{kind}')", kind
 
     def _call(self, node: Any) -> tuple[str, str]:
-        name, arguments = str(node.name), [one.value for one in node.parameters]
+        name, arguments = str(node.name), [parameter.value for parameter in node.parameters]
         if name in ("SHL", "SHR"):
             text, kind = self._expression(arguments[0])
             assert kind in BITS

@@ -90,16 +90,20 @@ def read(path: Path) -> tuple[Any, Shells, DictSupplementaryFileContainer]:
     files = DictSupplementaryFileContainer()
     with AASXReader(path, failsafe=False) as reader:
         reader.read_into(store, files)
-    shells = {one.id_short: one for one in store if isinstance(one, model.AssetAdministrationShell)}
+    shells = {
+        shell.id_short: shell
+        for shell in store
+        if isinstance(shell, model.AssetAdministrationShell)
+    }
     return store, shells, files
 
 
 def submodel(store: Any, shell: model.AssetAdministrationShell, semantic: str) -> Any:
     """The submodel of a shell that means this."""
     (found,) = (
-        one
-        for one in (reference.resolve(store) for reference in shell.submodel)
-        if one.semantic_id == meaning(semantic)
+        submodel
+        for submodel in (reference.resolve(store) for reference in shell.submodel)
+        if submodel.semantic_id == meaning(semantic)
     )
     return found
 
@@ -220,13 +224,13 @@ def test_a_unit_is_derived_from_its_type(database: Assets, tmp_path: Path) -> No
     assert kind.asset_information.asset_kind is model.AssetKind.TYPE
     assert unit.asset_information.asset_kind is model.AssetKind.INSTANCE
     assert unit.asset_information.asset_type == kind.asset_information.global_asset_id
-    assert [one.value for one in unit.asset_information.specific_asset_id] == ["cell-3"]
+    assert [asset_id.value for asset_id in unit.asset_information.specific_asset_id] == ["cell-3"]
 
 
 def test_ids_are_the_same_in_every_export(database: Assets, tmp_path: Path) -> None:
-    first = {one.id for one in read(written(tmp_path / "a.aasx", database.records()))[0]}
+    first = {record.id for record in read(written(tmp_path / "a.aasx", database.records()))[0]}
     database.add(Record("instance", "cell-3", "vs-40", {"ejector": {"h1_mbar": 700}}))
-    second = {one.id for one in read(written(tmp_path / "b.aasx", database.records()))[0]}
+    second = {record.id for record in read(written(tmp_path / "b.aasx", database.records()))[0]}
     assert first == second
 
 
@@ -271,7 +275,7 @@ def test_the_characteristic_diagram_can_be_read(database: Assets, tmp_path: Path
 
 
 def numbers(listed: Any) -> list[float]:
-    return [one.value for one in listed.value]
+    return [element.value for element in listed.value]
 
 
 @pytest.mark.parametrize(
@@ -294,7 +298,11 @@ def test_logs_are_external_segments(
     assert element(segment, "File").value == where
     assert element(segment, "Name").value["en"] == "healthy day.mcap"
     assert not any("mcap" in name for name in files)
-    assert not [one for one in shells["vs_40"].submodel if "TimeSeries" in str(one.resolve(store))]
+    assert not [
+        reference
+        for reference in shells["vs_40"].submodel
+        if "TimeSeries" in str(reference.resolve(store))
+    ]
     conforming(path)
 
 
@@ -476,11 +484,11 @@ def test_every_file_that_a_shell_names_is_there(
     models = {"cell-3": read_fmu(fmu)}
     store, _, files = read(written(tmp_path / "a.aasx", database.records(), models))
     named = {
-        one.value
+        element.value
         for inside in store
         if isinstance(inside, model.Submodel)
-        for one in elements(inside)
-        if isinstance(one, model.File) and str(one.value).startswith("/")
+        for element in elements(inside)
+        if isinstance(element, model.File) and str(element.value).startswith("/")
     }
     assert named == set(files)
 

@@ -11,8 +11,8 @@ END = BEGIN + 10 * DAY_NS
 
 
 def raised(name: str, alarm: str, *seconds: float, lasting: float | None = 1.0) -> list[Named]:
-    begun = [BEGIN + round(one * S) for one in seconds]
-    over = [None if lasting is None else one + round(lasting * S) for one in begun]
+    begun = [BEGIN + round(second * S) for second in seconds]
+    over = [None if lasting is None else begin_ns + round(lasting * S) for begin_ns in begun]
     return [
         (name, Episode(alarm, at, end, raised_as=alarm))
         for at, end in zip(begun, over, strict=True)
@@ -21,7 +21,7 @@ def raised(name: str, alarm: str, *seconds: float, lasting: float | None = 1.0) 
 
 def test_rates_are_of_all_ejectors_together() -> None:
     spread = raised("a", "x", *(3600.0 * hour for hour in range(120)))
-    burst = raised("b", "y", *(100.0 + 50.0 * one for one in range(12)))
+    burst = raised("b", "y", *(100.0 + 50.0 * n for n in range(12)))
     found = statistics([*spread, *burst], BEGIN, END)
     assert (found.count, found.days) == (132, 10.0)
     assert found.average == pytest.approx(132 / 1440)
@@ -54,7 +54,9 @@ def test_what_nobody_was_told_of_counts_for_nothing() -> None:
 
 def test_only_the_ten_most_frequent_are_named() -> None:
     many = [
-        one for n in range(12) for one in raised("a", f"x{n:02}", *range(0, 600 * (n + 1), 600))
+        episode
+        for n in range(12)
+        for episode in raised("a", f"x{n:02}", *range(0, 600 * (n + 1), 600))
     ]
     top = statistics(many, BEGIN, END).top
     assert [alarm for (_, alarm), _ in top] == [f"x{n:02}" for n in range(11, 1, -1)]

@@ -37,13 +37,13 @@ def episodes(changes: Iterable[Change]) -> list[Episode]:
     """The episodes that changes in their order make, in the order they were raised."""
     diary, found = Diary(), dict[tuple[int, str], Episode]()
     for change in changes:
-        found |= {(one.raised_ns, one.raised_as): one for one in diary.take(change)}
+        found |= {(episode.raised_ns, episode.raised_as): episode for episode in diary.take(change)}
     return list(found.values())
 
 
 def seen(alarm: Alarm, *values: tuple[float, float]) -> list[tuple[float, Deed]]:
     """Show values at times (s); gives when what happened."""
-    changes = [one for time, value in values for one in alarm.see(round(time * S), value)]
+    changes = [change for time, value in values for change in alarm.see(round(time * S), value)]
     return [(change.time_ns / S, change.deed) for change in changes]
 
 
@@ -166,7 +166,7 @@ RULES = (
 def test_an_alarm_by_design_says_nothing_while_another_stands() -> None:
     board = Board(RULES)
     changes = board.see(S, {"silence": 1.0, "leakage": 300.0})
-    assert [(one.alarm, one.deed, one.announced) for one in changes] == [
+    assert [(change.alarm, change.deed, change.announced) for change in changes] == [
         ("stale", Deed.RAISED, True),
         ("leak", Deed.RAISED, False),
         ("leak", Deed.SUPPRESSED, False),
@@ -174,7 +174,7 @@ def test_an_alarm_by_design_says_nothing_while_another_stands() -> None:
     ]
     assert [alarm.rule.name for alarm in board.standing()] == ["stale"]
     changes = board.see(2 * S, {"silence": 0.0})
-    assert [(one.alarm, one.deed, one.announced) for one in changes] == [
+    assert [(change.alarm, change.deed, change.announced) for change in changes] == [
         ("stale", Deed.CLEARED, False),
         ("leak", Deed.UNSUPPRESSED, True),
         ("slow", Deed.UNSUPPRESSED, False),
@@ -208,7 +208,7 @@ def test_episodes_have_their_lengths_and_who_has_seen_them() -> None:
         Episode("leak", 6 * S, 9 * S, 7 * S, "ann"),
         Episode("leak", 20 * S),
     ]
-    assert [one.seconds for one in found] == [3.0, 3.0, None]
+    assert [cycle.seconds for cycle in found] == [3.0, 3.0, None]
 
 
 # No chattering.
@@ -307,7 +307,7 @@ class AnyHistory(RuleBasedStateMachine):
 
     @invariant()
     def what_latches_stays_until_it_is_seen(self) -> None:
-        for episode in episodes([one for one in self.history if one.alarm == "leak"]):
+        for episode in episodes([change for change in self.history if change.alarm == "leak"]):
             if episode.cleared_ns is not None:
                 assert episode.acknowledged_ns is not None
                 assert episode.raised_ns <= episode.acknowledged_ns <= episode.cleared_ns
@@ -343,10 +343,12 @@ class AnyHistory(RuleBasedStateMachine):
         if self.alarm.state is State.UNACKNOWLEDGED:
             raised = [
                 n
-                for n, one in enumerate(self.history)
-                if one.alarm == "leak" and one.deed is Deed.RAISED
+                for n, change in enumerate(self.history)
+                if change.alarm == "leak" and change.deed is Deed.RAISED
             ][-1]
-            assert any(one.announced and one.alarm == "leak" for one in self.history[raised:])
+            assert any(
+                change.announced and change.alarm == "leak" for change in self.history[raised:]
+            )
 
 
 TestAnyHistory = AnyHistory.TestCase
@@ -381,7 +383,7 @@ def document(text: str) -> Document:
 
 def test_rules_survive_their_file() -> None:
     rules = read_rules(document(TEXT))
-    assert [one.name for one in rules] == ["stale", "leak"]
+    assert [rule.name for rule in rules] == ["stale", "leak"]
     assert rules[1].suppressed_by == ("stale",)
     assert read_rules(document(write_rules(rules))) == rules
 
@@ -427,8 +429,8 @@ def test_a_rule_that_cannot_be_is_refused_with_its_place(old: str, new: str, sai
 
 def test_the_rules_that_come_with_the_program_watch_what_there_is() -> None:
     rules = default_rules()
-    assert {one.value for one in rules} == NAMES
-    assert all(one.consequence and one.action for one in rules)
+    assert {rule.value for rule in rules} == NAMES
+    assert all(rule.consequence and rule.action for rule in rules)
     assert read_rules(document(write_rules(rules))) == rules
 
 
@@ -452,7 +454,9 @@ def test_a_warning_that_could_not_be_judged_keeps_its_alarm() -> None:
     over = event(Kind.CYCLE, warnings=["leakage_over_limit"], leakage_measured=300.0)
     unknown = event(Kind.CYCLE, warnings=["h1_not_reached"], h1_not_reached_measured=1.0)
     good = event(Kind.CYCLE, warnings=[], leakage_measured=30.0)
-    found = [deeds(board.see(n * S, values(one))) for n, one in enumerate((over, unknown, good))]
+    found = [
+        deeds(board.see(n * S, values(value))) for n, value in enumerate((over, unknown, good))
+    ]
     assert found == [[Deed.RAISED], [], [Deed.CLEARED]]
 
 
@@ -467,7 +471,7 @@ def test_a_file_without_alarms_is_none(tmp_path: Path) -> None:
 
 
 def test_a_rule_on_the_deviation_is_one_for_each_cause() -> None:
-    made = {one.name: one for one in board_rules(None)}
+    made = {rule.name: rule for rule in board_rules(None)}
     assert {f"deviation_{cause}" for cause in (*EFFECTS, "unlisted", "unknown")} < set(made)
     assert "deviation" not in made
     leakage = made["deviation_leakage"]
@@ -484,14 +488,14 @@ def test_what_the_deviation_suppresses_every_cause_does(tmp_path: Path) -> None:
     text = text.replace(old, 'suppressed_by = ["deviation"]')
     (tmp_path / "alarms.toml").write_text(text)
     (tmp_path / "cell.toml").write_text('[alarms]\nrules = "alarms.toml"\n')
-    made = {one.name: one for one in board_rules(Document.read(tmp_path / "cell.toml"))}
+    made = {rule.name: rule for rule in board_rules(Document.read(tmp_path / "cell.toml"))}
     assert made["valve_protection"].latching
     by = made["supply_out_of_range"].suppressed_by
     assert by == tuple(f"deviation_{cause}" for cause in (*EFFECTS, "unlisted", "unknown"))
 
 
 def test_an_alarm_may_be_suppressed_by_one_cause_alone() -> None:
-    made = {one.name: one for one in board_rules(None)}
+    made = {rule.name: rule for rule in board_rules(None)}
     assert made["supply_out_of_range"].suppressed_by == (
         "plc_stale",
         "deviation_supply_pressure_drop",
@@ -514,17 +518,19 @@ def test_what_nobody_was_told_of_is_over_with_what_suppressed_it() -> None:
     board, changes = quiet_figure()
     changes += board.see(5 * S, {"leakage": 30.0})
     changes += board.see(9 * S, {"fault": 0.0})  # long before its own delay has passed
-    assert not any(one.announced for one in changes if one.alarm == "leak")
+    assert not any(change.announced for change in changes if change.alarm == "leak")
     assert board["leak"].state is State.NORMAL
     diary = Diary()
-    *_, over = [one for change in changes for one in diary.take(change) if one.alarm == "leak"]
+    *_, over = [
+        episode for change in changes for episode in diary.take(change) if episode.alarm == "leak"
+    ]
     assert (over.is_over, over.acknowledged_by) == (True, "suppression")
 
 
 def test_what_still_stands_is_announced_with_the_end_of_what_suppressed_it() -> None:
     board, _ = quiet_figure()
     changes = board.see(9 * S, {"fault": 0.0})
-    assert [one.deed for one in changes if one.announced] == [Deed.UNSUPPRESSED]
+    assert [change.deed for change in changes if change.announced] == [Deed.UNSUPPRESSED]
     assert board["leak"].state is State.UNACKNOWLEDGED
 
 
@@ -533,7 +539,9 @@ def test_who_acknowledged_what_was_suppressed_stays_known() -> None:
     changes += board["leak"].acknowledge(3 * S, "ann")
     changes += board.see(5 * S, {"leakage": 30.0}) + board.see(9 * S, {"fault": 0.0})
     diary = Diary()
-    *_, over = [one for change in changes for one in diary.take(change) if one.alarm == "leak"]
+    *_, over = [
+        episode for change in changes for episode in diary.take(change) if episode.alarm == "leak"
+    ]
     assert (over.is_over, over.acknowledged_by) == (True, "ann")
 
 
@@ -547,7 +555,7 @@ def test_a_rule_on_what_nobody_says_is_refused(tmp_path: Path) -> None:
 def test_an_alarm_goes_on_under_another_name() -> None:
     board, diary = Board(board_rules(None)), Diary()
     changes = board.see(S, deviating("leakage"))
-    changes = [one for one in changes if one.deed is not Deed.SUPPRESSED]
+    changes = [change for change in changes if change.deed is not Deed.SUPPRESSED]
     changes += board["deviation_leakage"].acknowledge(2 * S, "ann")
     changes += board.rename(3 * S, "deviation.leakage", "deviation.porous_leakage")
     assert board["deviation_leakage"].state is State.NORMAL
@@ -555,15 +563,15 @@ def test_an_alarm_goes_on_under_another_name() -> None:
     assert deeds(changes) == [Deed.RAISED, Deed.ACKNOWLEDGED, Deed.RENAMED]
     assert not changes[-1].announced  # somebody takes care already
     assert board.see(4 * S, {}) == []
-    changes += [one for one in board.see(5 * S, deviating()) if one.deed is Deed.CLEARED]
-    assert [len(diary.take(one)) for one in changes] == [1, 1, 1, 1]
+    changes += [change for change in board.see(5 * S, deviating()) if change.deed is Deed.CLEARED]
+    assert [len(diary.take(change)) for change in changes] == [1, 1, 1, 1]
     assert episodes(changes) == [Episode("deviation_porous_leakage", S, 5 * S, 2 * S, "ann")]
 
 
 def test_what_keeps_a_name_quiet_does_not_follow_to_the_other() -> None:
     board = Board(board_rules(None))
     list(board["deviation_leakage"].shelve(0, 3600.0, "ann"))
-    assert not any(one.announced for one in board.see(S, deviating("leakage")))
+    assert not any(change.announced for change in board.see(S, deviating("leakage")))
     (renamed,) = board.rename(2 * S, "deviation.leakage", "deviation.suction_loss")
     assert renamed.announced
     assert board["deviation_suction_loss"].state is State.UNACKNOWLEDGED

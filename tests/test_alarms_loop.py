@@ -58,7 +58,7 @@ def cycle(seconds: float, *warnings: str, **data: Any) -> Event:
 
 
 def diagnosis(seconds: float, of_s: float, *causes: str, verdict: str = "explained") -> Event:
-    found = [{"effect": one, "course": "step", "probability": 0.9} for one in causes]
+    found = [{"effect": cause, "course": "step", "probability": 0.9} for cause in causes]
     answer = {"verdict": verdict, "causes": found}
     return event(seconds, Kind.DIAGNOSIS, alarm_ns=round(of_s * S), answer=answer)
 
@@ -87,7 +87,7 @@ class Desk:
 
     @property
     def before(self) -> Before:
-        going_on = [one for one in self.news.episodes.values() if not one.is_over]
+        going_on = [episode for episode in self.news.episodes.values() if not episode.is_over]
         return Before(self.news.states, going_on)
 
 
@@ -114,7 +114,7 @@ class Stream:
 
     def _heard(self, events: list[Event]) -> list[str]:
         self.said += events
-        return [f"{one.data['alarm']} {one.data['deed']}" for one in events]
+        return [f"{event.data['alarm']} {event.data['deed']}" for event in events]
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
@@ -136,7 +136,7 @@ def test_a_clock_that_is_set_shortens_no_delay(step_s: int, silent: bool) -> Non
     assert not said(5, deviation(5))
     for seconds in (10, 30, 64):
         assert not said(seconds)
-    assert [one.data["deed"] for one in said(66)] == ["raised"]
+    assert [event.data["deed"] for event in said(66)] == ["raised"]
 
 
 def test_rows_that_come_late_shorten_no_delay() -> None:
@@ -149,7 +149,7 @@ def test_rows_that_come_late_shorten_no_delay() -> None:
     for seconds in range(6, 51):
         assert not alarms.follow(rows(seconds), [])
     now = 66.0
-    assert [one.data["deed"] for one in alarms.follow(rows(66), [])] == ["raised"]
+    assert [event.data["deed"] for event in alarms.follow(rows(66), [])] == ["raised"]
 
 
 def test_what_was_found_out_before_a_failure_is_said_the_next_time() -> None:
@@ -425,7 +425,7 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> No
     )
     with open_store(url) as store:
         before = store.before(UNIT)
-        (episode,) = [one for one in before.going_on if one.alarm == name]
+        (episode,) = [episode for episode in before.going_on if episode.alarm == name]
         assert before.states[name] == Kept(active=True, acknowledged=False)
         assert episode.evidence["sigma"] == deviation.data["sigma"]
         assert episode.evidence["last_cycle"] > episode.evidence["first_cycle"]
@@ -434,12 +434,12 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> No
         store.save(UNIT, News(states, {}, {number: ""}))
     seen = one_run("leakage=2.0")
     assert seen.of(Kind.DEVIATION)
-    assert name not in [one.data["alarm"] for one in seen.of(Kind.ALARM)]
+    assert name not in [event.data["alarm"] for event in seen.of(Kind.ALARM)]
     with open_store(url) as store:
         assert store.states(UNIT)[name] == Kept(active=True, acknowledged=True)
-        assert len([one for one in store.episodes(UNIT) if one.alarm == name]) == 1
+        assert len([episode for episode in store.episodes(UNIT) if episode.alarm == name]) == 1
         assert store.episodes(UNIT, episode.raised_ns + 1) == [
-            one for one in store.episodes(UNIT) if one.raised_ns > episode.raised_ns
+            later for later in store.episodes(UNIT) if later.raised_ns > episode.raised_ns
         ]
 
 
@@ -501,7 +501,7 @@ def test_only_a_run_that_is_asked_to_writes_a_database(tmp_path: Path) -> None:
     alarms.follow(rows(5), [deviation(5)])
     alarms.close()
     with open_store(tmp_path / "alarms.sqlite") as store:
-        assert [one.alarm for one in store.episodes(UNIT)] == [LEAK]
+        assert [episode.alarm for episode in store.episodes(UNIT)] == [LEAK]
 
 
 def test_what_is_wrong_in_the_configuration_is_said_before_the_run(tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def offered(evidence: Evidence) -> set[str]:
     weights = covariance(evidence).of(evidence.judged)
     moved = signatures(evidence, weights.cycles)
     found = promises(evidence, weights, columns(evidence, weights, moved), each=1)
-    return {one.hypothesis[0].effect for one in found}
+    return {fit.hypothesis[0].effect for fit in found}
 
 
 def test_where_no_air_is_saved_no_switching_is_looked_for() -> None:

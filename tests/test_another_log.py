@@ -21,7 +21,7 @@ def recorded(longer: float, seed: int, *faults: str) -> Samples:
     rig = rigs.config("gripper").document.section(PlcSettings, "plc")
     program = rig.program.model_copy(update={"suction_ms": longer * rig.program.suction_ms})
     rig = rig.model_copy(update={"program": program})
-    parts = with_truth(rig, 20.0, [parse_fault(one) for one in faults], seed)
+    parts = with_truth(rig, 20.0, [parse_fault(fault) for fault in faults], seed)
     return np.concatenate([samples for samples, _ in parts])
 
 

@@ -153,7 +153,7 @@ def commanded(tutorial: Read) -> Path:
             begun.monitor,
             begun.asset,
         )
-        rows, own = (np.concatenate(list(one)) for one in (blocks, healthy._samples()))
+        rows, own = (np.concatenate(list(stream)) for stream in (blocks, healthy._samples()))
         assert rows.tobytes() == own.tobytes()
         return calibrated._calibration
 
@@ -209,7 +209,7 @@ def test_key_figures_are_those_of_the_command(
     assert command(monkeypatch, "figures", "show", "today.mcap", "--json", "figures.json") == 0
     told = json.loads((here / "figures.json").read_text())["cycles"]
     cycles = twin.open(commanded / "today.mcap").cycles()
-    assert cycles == [{k: v for k, v in one.items() if k != "alarms"} for one in told]
+    assert cycles == [{k: v for k, v in answer.items() if k != "alarms"} for answer in told]
     assert {f"{name}_measured" for name in FIGURES} >= {k for k in cycles[2] if "_meas" in k}
 
 
@@ -536,7 +536,7 @@ def test_a_simulated_effect_is_there() -> None:
     time = np.arange(0.0, 1.0, 1e-3)
     on, off = time > 0.1, np.zeros(len(time))
     shift = {"ambient_pressure": {"shift": -20.0}}
-    plain, shifted = (twin.simulate(GRIPPER, time, on, off, one) for one in (None, shift))
+    plain, shifted = (twin.simulate(GRIPPER, time, on, off, effects) for effects in (None, shift))
     fell = plain["pressure_pa"][0] - shifted["pressure_pa"][0]
     assert fell == pytest.approx(20.0 * MBAR)
 

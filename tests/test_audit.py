@@ -33,7 +33,7 @@ def test_a_component_is_in_the_scope_of_whoever_needs_it() -> None:
     names = ("Mid", "leaf_package", "rich", "extra-only", "windows-only", "pytest")
     document = {"components": [component(name) for name in names]}
     audit.scoped(document, ["mid>=1"], ["extra-only"], lambda name: NEEDS.get(name, []))
-    scopes = {one["name"]: one["scope"] for one in document["components"]}
+    scopes = {component["name"]: component["scope"] for component in document["components"]}
     assert [name for name in names if scopes[name] == "required"] == ["Mid", "leaf_package"]
     assert [name for name in names if scopes[name] == "optional"] == ["rich", "extra-only"]
 
@@ -71,7 +71,9 @@ def test_an_advisory_holds_for_the_versions_that_it_says(
 ) -> None:
     every = ("1.0", "1.4.9", "1.5rc1", "1.5", "2.0", "3.0")
     found = [
-        one for one in every if audit.matching_advisories([advisory(**affected)], {"mid": one})
+        version
+        for version in every
+        if audit.matching_advisories([advisory(**affected)], {"mid": version})
     ]
     assert found == versions
 

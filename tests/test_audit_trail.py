@@ -30,7 +30,7 @@ class Trail:
         self.now_ns += 1_000_000
 
     def whos(self) -> list[str]:
-        return [one["who"] for one in records(self.folder)[0]]
+        return [entry["who"] for entry in records(self.folder)[0]]
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_a_record_says_who_did_what_from_where_and_when(trail: Trail) -> None:
 def test_records_of_both_files_come_by_time(trail: Trail) -> None:
     for what in (Act.WRONG_PASSWORD, Act.LOGGED_IN, Act.DENIED, "shelved", Act.THROTTLED):
         trail.record(what)
-    assert [one["what"] for one in records(trail.folder)[0]] == [
+    assert [entry["what"] for entry in records(trail.folder)[0]] == [
         *("wrong_password", "logged_in", "denied", "shelved", "throttled")
     ]
     assert len((trail.folder / REFUSED).read_text().splitlines()) == 3
@@ -73,9 +73,9 @@ def test_it_is_bounded_and_the_oldest_goes(trail: Trail, monkeypatch: pytest.Mon
     for number in range(20):
         trail.record(who=str(number))
     files = sorted(trail.folder.iterdir())
-    assert [one.name for one in files] == ["audit.1.jsonl", "audit.2.jsonl", "audit.jsonl"]
-    assert all(one.stat().st_size <= 300 for one in files)
-    kept = [int(one) for one in trail.whos()]
+    assert [file.name for file in files] == ["audit.1.jsonl", "audit.2.jsonl", "audit.jsonl"]
+    assert all(file.stat().st_size <= 300 for file in files)
+    kept = [int(name) for name in trail.whos()]
     assert kept == list(range(kept[0], 20))
     assert len(kept) > 4
 
@@ -106,7 +106,7 @@ def test_a_record_is_on_the_disk_at_once(tmp_path: Path) -> None:
     )
     process = subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
     assert process.returncode == 9
-    assert [one["who"] for one in records(tmp_path)[0]] == ["ann"]
+    assert [entry["who"] for entry in records(tmp_path)[0]] == ["ann"]
 
 
 def test_a_disk_that_fails_is_told_once_and_nobody_waits(
@@ -149,7 +149,7 @@ def test_a_process_that_hangs_while_it_writes_is_not_waited_for(
     finally:
         os.close(handle)
     assert trail.whos() == ["ann", "bob"]
-    assert [one.name for one in trail.folder.iterdir()] == [DONE]  # not moved by two at once
+    assert [file.name for file in trail.folder.iterdir()] == [DONE]  # not moved by two at once
 
 
 def test_what_a_terminal_would_act_on_is_not_printed(trail: Trail) -> None:

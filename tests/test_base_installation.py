@@ -161,7 +161,7 @@ def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
     ],
 )
 def test_the_main_way_needs_no_extra(command: str, says: str, base: Run, log: Path) -> None:
-    arguments = [{"L": str(log), "C": str(GRIPPER)}.get(one, one) for one in command.split()]
+    arguments = [{"L": str(log), "C": str(GRIPPER)}.get(word, word) for word in command.split()]
     assert says in done(base(*arguments))
 
 
@@ -199,13 +199,13 @@ HINTS = {
 
 
 @pytest.mark.parametrize(
-    ("extra", "command"), [(extra, one) for extra, some in HINTS.items() for one in some]
+    ("extra", "command"), [(extra, hint) for extra, some in HINTS.items() for hint in some]
 )
 def test_without_its_extra_a_command_says_what_to_install(
     extra: str, command: str, base: Run, log: Path, tmp_path: Path
 ) -> None:
     paths = {"L": log, "C": GRIPPER, "U": OPC_UA}
-    refused = base(*(paths.get(one, one) for one in command.split()))
+    refused = base(*(paths.get(word, word) for word in command.split()))
     assert refused.returncode == ConfigError.exit_code, refused.stderr
     first, second = refused.stderr.splitlines()
     assert first.startswith("twin: ")

@@ -120,4 +120,4 @@ def test_few_cycles_make_a_limit_wider() -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_the_shipped_units_say_how_many_cycles_they_know(name: str) -> None:
     figures = rigs.config(name).monitor.healthy.figures
-    assert {one.cycles >= 30 for one in figures.values()} == {True}
+    assert {figure.cycles >= 30 for figure in figures.values()} == {True}

@@ -40,7 +40,7 @@ def single(effect: str, **more: Any) -> Case:
 
 def test_what_is_stated_is_compared_with_how_often_it_is_right() -> None:
     named = [*["leakage"] * 3, "porous_leakage"]
-    sure = [Case("single", n, "gripper", [LEAK], answer(one)) for n, one in enumerate(named)]
+    sure = [Case("single", n, "gripper", [LEAK], answer(causes)) for n, causes in enumerate(named)]
     doubted = Case("unlisted", 9, "gripper", [], answer("leakage", probability=0.6))
     page = tables([*sure, doubted])
     assert "| 95% to 98% | 4 | 97.0% | 75.0% | 19% to 99% |" in page

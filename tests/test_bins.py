@@ -66,7 +66,7 @@ def recorded(draw: st.DrawFn) -> tuple[Bytes, Bools, Ints]:
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     lengths = st.integers(1, 3) | st.integers(1, 900)
     runs = draw(st.lists(st.tuples(st.sampled_from(Phase), lengths), max_size=8))
-    phase = np.repeat([one for one, _ in runs], [rows for _, rows in runs]).astype(np.uint8)
+    phase = np.repeat([run for run, _ in runs], [rows for _, rows in runs]).astype(np.uint8)
     usable = random.random(len(phase)) < draw(st.sampled_from([0.0, 0.1, 0.9, 1.0]))
     starts = draw(st.lists(st.integers(0, 3000), max_size=4, unique=True))
     return phase, usable, np.array(sorted(starts), np.int64)
@@ -129,8 +129,8 @@ def test_a_cycle_is_averaged_as_its_bins_are(found: tuple[Bytes, Bools, Ints], a
     off = np.where(usable, random.normal(size=len(phase)), np.nan)
     bins, mean, through = averaged(phase, off, drawn, expected)
     apart_from = binned(phase, usable, np.zeros(1, np.int64))
-    for one in fields(bins):
-        np.testing.assert_array_equal(getattr(bins, one.name), getattr(apart_from, one.name))
+    for field in fields(bins):
+        np.testing.assert_array_equal(getattr(bins, field.name), getattr(apart_from, field.name))
     np.testing.assert_allclose(mean, apart_from.mean(off))
     np.testing.assert_allclose(through, apart_from.through(drawn, expected), atol=1e-12)
 

@@ -62,11 +62,11 @@ def test_evacuation_takes_as_long_as_expected(name: str) -> None:
     for seed in HELD_OUT:
         cutter = CycleCutter()
         cycles = [*cutter.push(*beside(data, log_of(name, seed))), *cutter.flush()]
-        for cycle in (one for one in cycles if one.complete and one.settled):
+        for cycle in (cycle for cycle in cycles if cycle.complete and cycle.settled):
             times, ambient = cycle.samples["time_ns"], data.ambient.pressure_mbar * MBAR
             both = cycle.samples["pressure"], cycle.ticks["expected"]
             measured, expected = (
-                time_to_vacuum(PAPER_VACUUM, one.astype(float), times, ambient) for one in both
+                time_to_vacuum(PAPER_VACUUM, curve.astype(float), times, ambient) for curve in both
             )
             ratios.append(expected / measured)
     assert len(ratios) >= CYCLES
@@ -76,7 +76,7 @@ def test_evacuation_takes_as_long_as_expected(name: str) -> None:
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_log_determines_what_it_shows(name: str) -> None:
     fitted = calibrated(name).fitted
-    known = {one.name for one, sure in zip(FREE, fitted.determined, strict=True) if sure}
+    known = {free.name for free, sure in zip(FREE, fitted.determined, strict=True) if sure}
     assert known & set(TRUE) == DETERMINED[name]
     assert "ejector.response_off_ms" not in known  # the valve closes while pressure stands at H1
     assert fitted.data.ejector.response_off_ms == pytest.approx(12.0, abs=0.5)  # the type's
@@ -92,8 +92,8 @@ def test_intervals_hold_the_true_values_of_other_units() -> None:
     assert np.mean(np.abs(found) <= 1.96) >= 0.9
 
 
-def differ(one: Theta, other: Theta) -> set[int]:
-    return set(np.flatnonzero((one != other) & np.isfinite(one)))
+def differ(theta: Theta, other: Theta) -> set[int]:
+    return set(np.flatnonzero((theta != other) & np.isfinite(theta)))
 
 
 def test_what_the_model_leaves_out_of_a_line_is_in_the_intervals() -> None:
@@ -253,9 +253,9 @@ def test_hypotheses_in_a_bank_are_as_each_alone() -> None:
     data = calibrated("gripper").fitted.data
     cycles = Cycles.as_live(log_of("gripper")[:4000], data)
     ways = directions(data)
-    bank = [with_values(data, values(data) + 0.3 * ways[:, one]) for one in range(9)]
-    theta = np.stack([coefficients(one) for one in bank], axis=1)
-    alone = [cycles.off(theta[:, [one]])[:, 0] for one in range(9)]
+    bank = [with_values(data, values(data) + 0.3 * ways[:, direction]) for direction in range(9)]
+    theta = np.stack([coefficients(data) for data in bank], axis=1)
+    alone = [cycles.off(theta[:, [direction]])[:, 0] for direction in range(9)]
     assert cycles.off(theta) == pytest.approx(np.stack(alone, axis=1), abs=2.0)  # Pa
 
 
@@ -270,11 +270,14 @@ def test_ways_to_differ_are_independent_and_smooth() -> None:
     data = typed("gripper").data
     ways = directions(data)
     assert np.linalg.matrix_rank(ways) == len(FREE)
-    numbers = [one.key for one in FREE]
+    numbers = [free.key for free in FREE]
     x = np.linspace(0.0, 1.0, 2001)
     bends = ways[[numbers.index(key) for key in ("bulge", "skew", "bend_2", "bend_3")]]
     shapes = np.stack(
-        [bends[:, numbers.index("bulge") + one] @ x ** np.arange(4)[:, None] for one in range(4)]
+        [
+            bends[:, numbers.index("bulge") + power] @ x ** np.arange(4)[:, None]
+            for power in range(4)
+        ]
     )
     overlap = shapes @ shapes.T / len(x)
     assert overlap - np.diag(np.diag(overlap)) == pytest.approx(np.zeros((4, 4)), abs=1e-3)

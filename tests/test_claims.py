@@ -166,7 +166,7 @@ def test_the_model_is_as_far_behind_as_the_readme_says(name: str) -> None:
 
 
 def test_the_bank_looks_for_every_effect_in_small_steps() -> None:
-    steps = {one.effect: one.step for one in SUSPECTS}
+    steps = {suspect.effect: suspect.step for suspect in SUSPECTS}
     late = ("response_delay", "blow_off_delay", "slow_ramp_up", "sensor_lag")
     assert {steps[effect] for effect in late} == {0.5, 1.0}  # ms, as docs/isolation.md says
 
@@ -198,7 +198,17 @@ def test_the_example_that_unpacks_a_column_of_a_log_unpacks_it() -> None:
 
 # --- rig and model: CONTRIBUTING.md, Tests --------------------------------------------------------
 
-VOCABULARY = ("signals", "quality", "errors", "settings", "secret", "users", "events", "cpu_target", "extras")
+VOCABULARY = (
+    "signals",
+    "quality",
+    "errors",
+    "settings",
+    "secret",
+    "users",
+    "events",
+    "cpu_target",
+    "extras",
+)
 
 
 def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:
@@ -210,10 +220,10 @@ def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:
 
 
 def test_rig_and_model_share_no_code_but_the_vocabulary() -> None:
-    allowed = {f"twin.{one}" for one in VOCABULARY}
+    allowed = {f"twin.{name}" for name in VOCABULARY}
     for path in (rigs.ROOT / "drivers" / "plc").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("twin"):
                 assert node.module in allowed, path
             elif isinstance(node, ast.Import):
-                assert not any(one.name.startswith("twin") for one in node.names), path
+                assert not any(alias.name.startswith("twin") for alias in node.names), path

@@ -252,7 +252,7 @@ def test_the_log_says_it_at_its_end(tmp_path: Path) -> None:
     with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
         recorder.write(samples, ticks, events)
     with (tmp_path / "a.mcap").open("rb") as file:
-        stored = {one.name: one.metadata for one in make_reader(file).iter_metadata()}
+        stored = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     assert float(stored["clock"]["offset_ms"]) == events[-1].data["offset_ms"]
     assert float(stored["clock"]["drift_pm_ppm"]) == events[-1].data["drift_pm_ppm"]
     log = open_log(tmp_path / "a.mcap")

@@ -80,7 +80,7 @@ def test_a_rig_of_another_world_is_fitted_from_what_a_person_reads_off() -> None
     found = commissioned()
     assert found.verdict.residuals[Phase.SUCTION].times < 2.0
     assert found.verdict.residuals[Phase.HOLD].times < 2.0
-    worst = max(one.times for one in found.verdict.residuals.values())
+    worst = max(residual.times for residual in found.verdict.residuals.values())
     assert (found.verdict.word == "refused") == (worst > 2.0)  # blow-off is the hardest
 
 
@@ -97,7 +97,7 @@ def test_a_type_that_nobody_knows_begins_with_its_first_unit(tmp_path: Path) -> 
     record_, _ = store_first(commissioned().calibration, config, url, log)
     with open_chosen(url, config.document, write=False) as database:
         kinds = database.records("type", UNKNOWN_TYPE)
-        assert [one.name for one in kinds] == [UNKNOWN_TYPE]
+        assert [kind.name for kind in kinds] == [UNKNOWN_TYPE]
         assert set(kinds[0].data) == {"supply", "ejector"}
         assert database.records("instance", "unit-1")[0].id == record_.id
 
@@ -138,7 +138,7 @@ def test_a_search_stays_where_values_move() -> None:
     space = Space.of_market(typed("test_rig").data)
     alone = np.isfinite(space.low)
     bends = {"bulge", "skew", "bend_2", "bend_3"}  # a coordinate moves several of them
-    assert {one.key for one, bound in zip(space.free, alone, strict=True) if not bound} == bends
+    assert {free.key for free, bound in zip(space.free, alone, strict=True) if not bound} == bends
     inside = np.flatnonzero(alone & (space.low < -0.1) & (space.high > 0.1))
     for end, step in ((space.low, 0.1), (space.high, -0.1)):
         for number in inside:
@@ -160,7 +160,7 @@ def test_the_sensor_is_found_between_the_ends_of_the_line(place: float) -> None:
     shift = data.system.sensor_shift + place - sensor_place(data)
     system = data.system.model_copy(update={"sensor_shift": shift})
     space = Space.of_market(data.model_copy(update={"system": system})).on_the_line
-    number = [one.key for one in space.free].index("sensor_shift")
+    number = [free.key for free in space.free].index("sensor_shift")
     for end, bound in ((0.0, space.low), (1.0, space.high)):
         x = np.zeros(len(space.free))
         x[number] = bound[number]
@@ -175,7 +175,7 @@ def test_in_a_market_every_characteristic_falls_with_vacuum(tilts: list[float]) 
     """And its derivatives are those of its bends."""
     space = Space.of_market(typed("test_rig").data)
     x = np.zeros(len(space.free))
-    bends = [number for number, one in enumerate(space.free) if one.key in BENDS]
+    bends = [number for number, free in enumerate(space.free) if free.key in BENDS]
     x[bends] = tilts
     rises = np.diff(space.at(x).ejector.share(np.linspace(0.0, 1.0, 101)))
     assert (rises > -1e-12).all()
@@ -276,10 +276,10 @@ def test_a_fit_starts_with_cups_that_meet_a_part_late_and_without() -> None:
     """Late as the record shows it, or where it does not, as is usual."""
     data = config_of(logged(SEED, KIND).truth.readable).data
     plain, late = starts(data, np.nan), starts(data, 80.0 * MS)
-    assert {one.system.part_meets_ms for one in plain} == {0.0, COMES}
-    assert {one.system.part_meets_ms for one in late} == {0.0, 80.0}
+    assert {start.system.part_meets_ms for start in plain} == {0.0, COMES}
+    assert {start.system.part_meets_ms for start in late} == {0.0, 80.0}
     assert len(late) == len(plain)
-    assert all(coefficients(one)[c.COMPLIANCE] > 0.0 for one in late)
+    assert all(coefficients(start)[c.COMPLIANCE] > 0.0 for start in late)
 
 
 @pytest.mark.parametrize(("grows", "share"), [(25, 1.0), (40, 0.5), (8, 0.1)])
@@ -302,9 +302,9 @@ def test_how_long_suction_takes_to_grow_shows_where_that_is_slow_beside_the_fall
 def test_a_fit_starts_with_a_slow_jet_where_the_fall_grows_slowly() -> None:
     data = config_of(logged(SEED, KIND).truth.readable).data
     plain, slow = starts(data, np.nan), starts(data, np.nan, 25.0 * MS)
-    assert {one.ejector.ramp_up_ms for one in plain} == {data.ejector.ramp_up_ms}
-    assert {one.ejector.ramp_up_ms for one in slow} == {data.ejector.ramp_up_ms, 25.0}
-    assert {one.ejector.ramp_up_ms for one in starts(data, np.nan, 2.0)} == {
+    assert {start.ejector.ramp_up_ms for start in plain} == {data.ejector.ramp_up_ms}
+    assert {start.ejector.ramp_up_ms for start in slow} == {data.ejector.ramp_up_ms, 25.0}
+    assert {start.ejector.ramp_up_ms for start in starts(data, np.nan, 2.0)} == {
         data.ejector.ramp_up_ms
     }  # a tank that cups are behind is no slow jet
 
@@ -341,11 +341,11 @@ def test_the_shipped_gripper_is_followed_through_its_hose() -> None:
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:
     cups = config_of(logged(SEED, KIND).truth.readable).data
     tank = typed("test_rig").data
-    shrinks = [one.system.shrinks_ml for one in starts(cups, np.nan)]
+    shrinks = [start.system.shrinks_ml for start in starts(cups, np.nan)]
     assert max(shrinks) > 10.0 * min(shrinks) > 0.0
-    assert {one.system.stiff_mbar for one in starts(cups, np.nan)} == {30.0, 300.0}
+    assert {start.system.stiff_mbar for start in starts(cups, np.nan)} == {30.0, 300.0}
     # A vessel is rigid, or has cups behind it that somebody took for a part of it.
-    rigid, spreads, folds = sorted({one.system.shrinks_ml for one in starts(tank, np.nan)})
+    rigid, spreads, folds = sorted({start.system.shrinks_ml for start in starts(tank, np.nan)})
     assert (rigid, folds > 10.0 * spreads > 0.0) == (0.0, True)
 
 
@@ -417,7 +417,7 @@ def test_another_ambient_pressure_is_said_with_the_line_to_change() -> None:
     for unsure, said in ((4.0, True), (20.0, False)):
         sure[-1, -1] = unsure**2
         (*remark,) = another_ambient(told, replace(fitted, data=lower, free=free, covariance=sure))
-        assert [one.line for one in remark] == ["[data.ambient] pressure_mbar = 962"] * said
+        assert [line.line for line in remark] == ["[data.ambient] pressure_mbar = 962"] * said
 
 
 def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and_in_the_floor() -> (
@@ -462,7 +462,7 @@ def test_the_record_corrects_the_configuration_and_says_the_line() -> None:
     )
     assert guess.ejector.h1_mbar == pytest.approx(750.0, abs=12.0)
     assert guess.ambient.pressure_mbar == pytest.approx(1013.0, abs=1.0)
-    lines = [one.line.split(" =")[0] for one in remarks]
+    lines = [remark.line.split(" =")[0] for remark in remarks]
     assert "[data.ambient] pressure_mbar" in lines
     assert "[data.ejector] h1_mbar" in lines
     _, nothing = guessed(data, shipped_readings("gripper"))
@@ -519,14 +519,14 @@ def test_blow_off_that_no_row_commands_is_told_where_the_curve_shows_it() -> Non
     here["commands"] &= np.uint8(Command.SUCTION)
     assert "no row has blow-off commanded" in refused(here)
     _, remarks = guessed(typed("gripper").data, read(here))
-    assert any("no row of the record has blow-off" in one.text for one in remarks)
+    assert any("no row of the record has blow-off" in remark.text for remark in remarks)
 
 
 def test_kilopascals_taken_for_millibar_are_asked_about() -> None:
     here = samples_of(logged(SEED, KIND))
     here["pressure"] = 101300.0 - (101300.0 - here["pressure"]) / 10.0
     _, remarks = guessed(typed("gripper").data, read(here))
-    assert any("where ejectors make 300 and more" in one.text for one in remarks)
+    assert any("where ejectors make 300 and more" in remark.text for remark in remarks)
 
 
 def test_a_record_of_two_units_is_refused_with_the_cycle() -> None:
@@ -600,7 +600,9 @@ def test_what_few_cycles_show_counts_neither_as_left_nor_as_floor() -> None:
 
 
 def verdict(**times: float) -> Verdict:
-    return Verdict({Phase[name.upper()]: Residual(one * MBAR, MBAR) for name, one in times.items()})
+    return Verdict(
+        {Phase[name.upper()]: Residual(mbar * MBAR, MBAR) for name, mbar in times.items()}
+    )
 
 
 def test_the_worst_phase_gives_the_verdict() -> None:
@@ -613,7 +615,7 @@ def test_the_worst_phase_gives_the_verdict() -> None:
 
 def test_an_end_pressure_that_the_record_does_not_come_near_is_below_its_deepest() -> None:
     fitted = commissioned().calibration.fitted
-    number = [one.name for one in fitted.free].index(END_PRESSURE)
+    number = [free.name for free in fitted.free].index(END_PRESSURE)
     end = fitted.data.ejector.end_pressure_mbar * MBAR
     near, far = (replace(fitted, deepest=end + above) for above in (0.1 * MBAR, 100.0 * MBAR))
     assert near.reaches_end
@@ -626,7 +628,7 @@ def test_an_end_pressure_that_the_record_does_not_come_near_is_below_its_deepest
 def test_the_interval_of_what_is_scaled_is_one_of_its_logarithm() -> None:
     """A leak of 0.01 ± 0.006 sl/min is not below zero."""
     fitted, name = commissioned().calibration.fitted, "system.leak_sl_min"
-    number = [one.name for one in fitted.free].index(name)
+    number = [free.name for free in fitted.free].index(name)
     leak = fitted.free[number].of(fitted.data)
 
     def with_sigma(share: float) -> tuple[float, float]:
@@ -644,7 +646,7 @@ def test_the_interval_of_suction_counts_that_rigs_have_other_equations() -> None
     """However well a curve is followed, suction at ambient pressure is the model's own."""
     fitted = commissioned().calibration.fitted
     name = "ejector.suction_capacity_sl_min"
-    number = [one.name for one in fitted.free].index(name)
+    number = [free.name for free in fitted.free].index(name)
     value, form = fitted.free[number].of(fitted.data), fitted.free[number].model_form
     low, high = replace(fitted, covariance=0.0 * fitted.covariance).interval(name)
     assert (low, high) == pytest.approx((value / 1.54, value * 1.54), rel=0.01)
@@ -653,7 +655,7 @@ def test_the_interval_of_suction_counts_that_rigs_have_other_equations() -> None
 
 def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:
     fitted = commissioned().calibration.fitted
-    number = [one.key for one in fitted.free].index("sensor_shift")
+    number = [free.key for free in fitted.free].index("sensor_shift")
     near, told = (
         fitted.data.model_copy(
             update={"system": fitted.data.system.model_copy(update={"sensor_shift": shift})}
@@ -667,7 +669,7 @@ def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> 
         covariance = fitted.covariance.copy()
         covariance[number, number] = unsure**2
         remarks = list(misplaced(told, replace(fitted, covariance=covariance)))
-        assert [one.line.endswith("before the tubes") for one in remarks] == [True] * said
+        assert [remark.line.endswith("before the tubes") for remark in remarks] == [True] * said
     assert not list(misplaced(fitted.data, fitted))
 
 
@@ -692,4 +694,4 @@ def test_what_is_left_out_of_a_line_never_takes_inertia_away(factor: float) -> N
     data = config_of(logged(SEED, KIND).truth.readable).data
     system = data.system.model_copy(update={"line_inertia_factor": factor})
     theta, *others = with_left_out(data.model_copy(update={"system": system}))
-    assert all(one[c.INERTANCE] >= theta[c.INERTANCE] for one in others)
+    assert all(other[c.INERTANCE] >= theta[c.INERTANCE] for other in others)

@@ -70,7 +70,7 @@ def sides(logs: dict[str, Path]) -> dict[str, Side]:
 
 
 def by_name(found: Comparison) -> dict[str, Quantity]:
-    return {one.name: one for one in (*found.figures, *found.deviations)}
+    return {figure.name: figure for figure in (*found.figures, *found.deviations)}
 
 
 # What differs.
@@ -171,13 +171,17 @@ def test_same_with_the_same_is_called_different_as_seldom_as_promised(
     monkeypatch.setattr("twin.compare.compare.RESAMPLED", 10)  # the intervals are not looked at
     rng = np.random.default_rng(3)
     many = [compare(of_numbers(rng), of_numbers(rng)) for _ in range(300)]
-    assert 0.2 * WRONGLY <= np.mean([bool(one.different) for one in many]) <= 1.8 * WRONGLY
+    assert (
+        0.2 * WRONGLY
+        <= np.mean([bool(comparison.different) for comparison in many])
+        <= 1.8 * WRONGLY
+    )
 
 
 def test_the_clearest_is_said_first_and_what_follows_from_others_last() -> None:
     rng = np.random.default_rng(4)
     found = compare(of_numbers(rng), of_numbers(rng, leakage=9.0, t0=30.0, quality=60.0))
-    assert [one.name for one in found.different] == ["quality", "t0", "leakage"]
+    assert [figure.name for figure in found.different] == ["quality", "t0", "leakage"]
     said = conclusion(found)
     assert said.index("t0 ") < said.index("leakage ") < said.index("quality ")
 
@@ -193,7 +197,7 @@ def test_too_few_cycles_are_said() -> None:
 def test_a_figure_that_one_side_cannot_tell_is_a_dash(sides: dict[str, Side]) -> None:
     untold = [{**cycle, "leakage": np.nan} for cycle in sides["well"].measured]
     found = compare(replace(sides["well"], measured=untold), sides["leaks"])
-    (line,) = (one for one in in_words(found).splitlines() if one.startswith("leakage "))
+    (line,) = (line for line in in_words(found).splitlines() if line.startswith("leakage "))
     assert line.split()[2:3] == ["-"]
     assert line.split()[-2:] == ["-", "-"]
     json.dumps(plain(found), allow_nan=False)
@@ -216,25 +220,25 @@ IDLE, SUCTION, HOLD = (Phase.IDLE, 500), (Phase.SUCTION, 300), (Phase.HOLD, 25_0
 
 def test_a_long_cycle_stays_in_one_piece() -> None:
     cycles = list(whole([rows(IDLE, SUCTION, HOLD, IDLE, SUCTION, IDLE)]))
-    assert [len(one.samples) for one in cycles] == [500, 25_800, 800]
-    assert [one.complete for one in cycles] == [False, True, True]
+    assert [len(cycle.samples) for cycle in cycles] == [500, 25_800, 800]
+    assert [cycle.complete for cycle in cycles] == [False, True, True]
 
 
 def test_a_cycle_with_a_gap_is_none() -> None:
     samples, ticks = rows(IDLE, SUCTION, HOLD, IDLE, SUCTION, IDLE)
     samples["quality"][15_000] = Quality.GAP
     cycles = list(whole([(samples, ticks)]))
-    assert sum(len(one.samples) for one in cycles) == len(samples)
-    assert [one.complete for one in cycles][-1]
-    assert sum(one.complete for one in cycles) == 1
+    assert sum(len(cycle.samples) for cycle in cycles) == len(samples)
+    assert [cycle.complete for cycle in cycles][-1]
+    assert sum(cycle.complete for cycle in cycles) == 1
 
 
 def test_mean_and_spread_by_time_since_the_edge() -> None:
     rng = np.random.default_rng(6)
     curve, values = Curve(), rng.normal(size=(50, 400))
     since = np.arange(400) * 1e-3
-    for one in values:
-        curve.add(since, one)
+    for value in values:
+        curve.add(since, value)
     there = np.isfinite(curve.mean)
     pairs = values.reshape(50, 200, 2).mean(axis=2)  # of 1 ms in a bin
     assert there.sum() == 200
@@ -289,7 +293,7 @@ def test_the_command_says_writes_and_draws(
     document = json.loads(outputs[0].read_text())
     assert document["format"] == "ejector-twin-compare/1"
     assert document["conclusion"] == said.out.strip().splitlines()[-1]
-    figures = {one["name"]: one for one in document["figures"]}
+    figures = {figure["name"]: figure for figure in document["figures"]}
     leakage = figures["leakage"]
     assert leakage["differs"] is True
     assert leakage["low95"] < leakage["b"]["mean"] - leakage["a"]["mean"] < leakage["high95"]

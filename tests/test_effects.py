@@ -255,7 +255,7 @@ def test_by_the_law_of_a_wide_valve_a_slow_one_is_a_late_one() -> None:
     assert rises(grows)[1] > 120
 
 
-@pytest.mark.parametrize("law", [one.law for one in EFFECTS.values() if one.law])
+@pytest.mark.parametrize("law", [effect.law for effect in EFFECTS.values() if effect.law])
 def test_a_law_without_its_effect_changes_nothing(law: Law) -> None:
     theta = rigs.theta("gripper")
     expected = cycle(theta)[0]
@@ -351,7 +351,7 @@ def test_the_page_of_effects_has_their_laws() -> None:
                 if line.startswith(f"| `{effect.name}` | `{effect.law.name}`")
             )
             tried = re.sub(r"\(.*?\)", "", row.split("|")[3])
-            assert tuple(float(one) for one in tried.split(",")) == effect.law.tried
+            assert tuple(float(value) for value in tried.split(",")) == effect.law.tried
 
 
 def test_only_the_table_asks_whether_a_parameter_is_a_time() -> None:

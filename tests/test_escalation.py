@@ -60,7 +60,7 @@ class Desk:
         """What the changes since the last call, and the time, make people be told."""
         news = self.stream.said[self.heard :]
         self.heard = len(self.stream.said)
-        messages = [message for one in news for message in of_event(UNIT, one)]
+        messages = [message for happened in news for message in of_event(UNIT, happened)]
         return [*self._kept(messages), *self._kept()]
 
     def at(self, minute: float) -> list[str]:
@@ -68,14 +68,16 @@ class Desk:
         return self.then()
 
     def _kept(self, messages: list[Message] | None = None) -> list[str]:
-        documents = [json.loads(one.body) for one in messages or ()]
+        documents = [json.loads(message.body) for message in messages or ()]
         outcome = (
             self.escalation.due(self.now_ns)
             if messages is None
             else self.escalation.take(documents, self.now_ns)
         )
         with open_calls(self.path, UNIT) as store:
-            store.store(outcome, box_of(EMAIL, MAIL), EMAIL, [one.id for one in messages or ()])
+            store.store(
+                outcome, box_of(EMAIL, MAIL), EMAIL, [message.id for message in messages or ()]
+            )
         self.escalation.accept(outcome)
         bodies = [json.loads(mail.body) for mail in outcome.mails]
         return [f"{body['name']} {body['reason']} {body['count']}" for body in bodies]
@@ -163,7 +165,7 @@ def test_an_alarm_that_ended_while_no_mail_was_configured_is_not_escalated(desk:
     desk.stream.at(60)  # of which this escalation hears nothing
     standing = Stream(desk.stream.desk.before).alarms.standing()
     stated = [json.loads(restated(UNIT, alarm, 0).body) for alarm in standing]
-    assert [one["state"] for one in stated] == ["acknowledged"]
+    assert [body["state"] for body in stated] == ["acknowledged"]
     desk.escalation.accept(desk.escalation.take(stated, desk.now_ns))
     desk.heard = len(desk.stream.said)
     assert desk.at(40) == []

@@ -26,7 +26,7 @@ def exported(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str | Path
 
 
 def values(parameters: ParameterSet) -> dict[str, str]:
-    return {one.name: one.value for one in parameters.parameters}
+    return {parameter.name: parameter.value for parameter in parameters.parameters}
 
 
 @pytest.mark.needs("cc")
@@ -48,7 +48,7 @@ def test_a_configuration_says_which_and_what(
     options = ("--config", rigs.path_of("gripper"), "--fmi", "2", "--vessel", "outside")
     assert exported(monkeypatch, tmp_path, *options, "--sources-only", "-o", "a.fmu") == 0
     described = read_model_description(str(tmp_path / "a.fmu"))
-    known = {one.name: one for one in described.modelVariables}
+    known = {variable.name: variable for variable in described.modelVariables}
     assert described.fmiVersion == "2.0"
     assert known["vessel.pressure"].causality == "input"
     assert "vessel.inflow" not in known
@@ -111,13 +111,17 @@ def test_the_unit_lies_over_its_type_in_a_system_structure(
     assert exported(monkeypatch, tmp_path, "--id", "paper-unit", "-o", "a.ssp") == 0
     path = str(tmp_path / "a.ssp")
     component = read_ssd(path).system.elements[0]  # validated against the schema
-    sources = [one.source for one in component.parameterBindings]
+    sources = [binding.source for binding in component.parameterBindings]
     assert sources == ["resources/type.ssv", "resources/unit.ssv"]  # the later one holds
-    kind, unit = (values(read_ssv(path, resource=one)) for one in sources)
+    kind, unit = (values(read_ssv(path, resource=source)) for source in sources)
     extract(path, tmp_path / "all")
     fmu = str(tmp_path / "all" / component.source)
     described = read_model_description(fmu)
-    own = {one.name: one for one in described.modelVariables if one.causality == "parameter"}
+    own = {
+        variable.name: variable
+        for variable in described.modelVariables
+        if variable.causality == "parameter"
+    }
     assert set(kind) == set(own)
     assert 0 < len(unit) < len(kind)
     for name, value in unit.items():
@@ -147,7 +151,7 @@ def test_every_port_leads_out_of_the_system(
     options = ("--config", config, "--sources-only", "--vessel", where, "-o", "a.ssp")
     assert exported(monkeypatch, tmp_path, *options) == 0
     system = read_ssd(str(tmp_path / "a.ssp")).system
-    ports = {one.name: one.kind for one in system.connectors}
+    ports = {connector.name: connector.kind for connector in system.connectors}
     led = {(build_path(start), build_path(end)) for start, end in get_connections(system)}
     for name, kind in ports.items():
         ends = (f"system.{name}", f"system.ejector.{name}")

@@ -101,7 +101,7 @@ def test_a_database_that_is_not_there_is_made_and_said(
     heard = capsys.readouterr()
     assert f"making a new asset database, {new}" in heard.err
     with open_assets(new) as database, open_assets(saved.assets) as default:
-        (record,), (same,) = (one.records("instance", "leaky") for one in (database, default))
+        (record,), (same,) = (store.records("instance", "leaky") for store in (database, default))
     assert record.data == same.data  # with the data set of the log: a new database has no other
 
 
@@ -269,8 +269,8 @@ def test_the_switching_levels_move_and_nothing_else_does(evidence: Evidence) -> 
     assert after["h1_level"].mean == pytest.approx(before["h1_level"].mean + 15.0, abs=0.5)
     unsure = np.hypot(before["h1_level"].sigma, SURE * 15.0)
     assert after["h1_level"].sigma == pytest.approx(unsure, abs=0.1)  # a row is 0.2 mbar
-    assert {name: one for name, one in after.items() if name != "h1_level"} == {
-        name: one for name, one in before.items() if name != "h1_level"
+    assert {name: figure for name, figure in after.items() if name != "h1_level"} == {
+        name: figure for name, figure in before.items() if name != "h1_level"
     }
 
 
@@ -316,7 +316,7 @@ def test_terms_that_data_gave_are_in_it(evidence: Evidence) -> None:
     known = extended(unlisted, rigs.config("test_rig"))
     assert known is not None
     assert known.data.terms == (term,)
-    levels = [one["h1_level"] for one in evidence.figures if "h1_level" in one]
+    levels = [figures["h1_level"] for figures in evidence.figures if "h1_level" in figures]
     assert known.healthy.figures["h1_level"].mean == pytest.approx(np.mean(levels), abs=0.3)
     before = rigs.config("test_rig").monitor.healthy.figures["suction_mean"]
     assert abs(known.healthy.figures["suction_mean"].mean - before.mean) > 10.0  # no such term is

@@ -24,7 +24,11 @@ def packages_of(extra: str) -> list[Requirement]:
     packages: dict[str, Requirement] = {}
     for package in map(Requirement, DECLARED[extra]):
         if package.name == "ejector-twin":
-            packages |= {one.name: one for name in package.extras for one in packages_of(name)}
+            packages |= {
+                requirement.name: requirement
+                for name in package.extras
+                for requirement in packages_of(name)
+            }
         else:
             packages[package.name] = package
     return list(packages.values())
@@ -76,7 +80,9 @@ def test_a_checkout_is_installed_with_the_extra_from_wherever_one_is() -> None:
 
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_without_a_checkout_the_packages_are_named(extra: str, tmp_path: Path) -> None:
-    hinted = [Requirement(one) for one in shlex.split(install_hint(extra, tmp_path))[4:]]
+    hinted = [
+        Requirement(requirement) for requirement in shlex.split(install_hint(extra, tmp_path))[4:]
+    ]
     assert sorted(map(str, hinted)) == sorted(map(str, packages_of(extra)))
 
 

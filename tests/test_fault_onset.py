@@ -128,5 +128,7 @@ def test_no_size_is_told_that_the_effect_cannot_have(fault: str) -> None:
     for event in seen.of(Kind.DEVIATION):
         first = EFFECTS.get(str(event.data["effect"]))
         if first and "size" in event.data:
-            (most,) = {max(abs(one.low), abs(one.high)) for one in first.parameters}
+            (most,) = {
+                max(abs(parameter.low), abs(parameter.high)) for parameter in first.parameters
+            }
             assert abs(float(event.data["size"])) < most, event.text

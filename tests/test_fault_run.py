@@ -135,7 +135,7 @@ def test_growth_is_seen() -> None:
     verdict = fault_run.Verdict()
     fault_run.judge_growth(seen, verdict)
     assert verdict.problems == ["mb grew from 205 to 224"]
-    seen = [one | {"files": 9.0 + (i > 5)} for i, one in enumerate(seen[:12])]
+    seen = [row | {"files": 9.0 + (i > 5)} for i, row in enumerate(seen[:12])]
     verdict = fault_run.Verdict()
     fault_run.judge_growth(seen, verdict)
     assert verdict.problems == ["files grew from 9 to 10"]

@@ -76,8 +76,14 @@ def test_a_rate_gives_the_flow_where_the_volume_is_known() -> None:
 
 
 def test_a_peak_that_a_slow_logger_misses_lies_in_its_interval() -> None:
-    true = [CURVE["highest"].of(one) for one in stretches([known("gripper")]) if one.ended]
-    slow = [CURVE["highest"].of(one) for one in stretches([coarse(known("gripper"))]) if one.ended]
+    true = [
+        CURVE["highest"].of(stretch) for stretch in stretches([known("gripper")]) if stretch.ended
+    ]
+    slow = [
+        CURVE["highest"].of(stretch)
+        for stretch in stretches([coarse(known("gripper"))])
+        if stretch.ended
+    ]
     for one, other in zip(true, slow, strict=True):
         assert abs(one.value - other.value) < max(1.5 * other.half, 3.0)
         assert other.half < 60.0
@@ -89,7 +95,7 @@ def test_what_is_not_told_has_its_reason() -> None:
     assert whole["rate"].why.startswith("too few readings in the evacuation")
     on = np.flatnonzero(samples["commands"])
     inside = read(samples[on[0] + 60 : on[-1] - 10])
-    assert {one.why for one in inside.values()} == {
+    assert {figure.why for figure in inside.values()} == {
         "the record has no idle, from which vacuum counts"
     }
     begins = read(samples[on[0] + 60 :])
@@ -130,12 +136,12 @@ def graded(leak: float) -> list[Stretch]:
     faults = (f"leakage={leak}@0",) if leak else ()
     samples, _ = rigs.recorded("gripper", 30.0, faults, seed=int(100 * leak) + 3)
     found = stretches([with_derived(coarse(samples))])
-    return [one for one in found if one.ended][1:]
+    return [stretch for stretch in found if stretch.ended][1:]
 
 
 def figure(leak: float, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    found = [CURVE[name].of(one) for one in graded(leak)]
-    return np.array([one.value for one in found if not one.why])
+    found = [CURVE[name].of(stretch) for stretch in graded(leak)]
+    return np.array([figure.value for figure in found if not figure.why])
 
 
 def test_neighbouring_grades_of_a_leak_are_told_apart() -> None:

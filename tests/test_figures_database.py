@@ -135,7 +135,7 @@ def test_two_who_add_the_same_add_it_once(url: str) -> None:
 
     def work() -> None:
         with open_store(url) as store:
-            added.extend(add(store, one) for one in cycles)
+            added.extend(add(store, cycle) for cycle in cycles)
 
     both = [threading.Thread(target=work) for _ in range(2)]
     for thread in both:

@@ -182,7 +182,7 @@ def test_savings_are_told_with_how_sure_they_are(figures: Run, tmp_path: Path) -
     best = content["offered"][0]
     year = content["cycles_per_year"] * best["saved_nl"]["value"]
     assert best["saved_money"]["value"] == pytest.approx(year / 1e3 * 0.036, rel=1e-3)
-    assert all(one["why_not"] for one in content["refused"])
+    assert all(change["why_not"] for change in content["refused"])
 
 
 def test_without_a_price_savings_are_in_air(figures: Run, tmp_path: Path) -> None:

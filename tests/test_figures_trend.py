@@ -292,7 +292,7 @@ def test_scatter_is_seldom_called_a_step(correlation: float, most: float) -> Non
     rng = np.random.default_rng(16)
     record = times(7, 3000)
     found = [trend_of(record, kept(correlation, 3000, rng)).step for _ in range(TRIALS)]
-    assert np.mean([one is not None for one in found]) <= most
+    assert np.mean([slope is not None for slope in found]) <= most
 
 
 @pytest.mark.parametrize("rise", [1.0, 3.0, 10.0, 100.0])

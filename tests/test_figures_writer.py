@@ -139,7 +139,7 @@ def test_what_is_stored_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
 
     class Counting:
         def add(self, _unit: Unit, _data: str, _source: str, cycles: list[dict[str, int]]) -> None:
-            batches.put([one["cycle"] for one in cycles])
+            batches.put([row["cycle"] for row in cycles])
 
         def close(self) -> None: ...
 

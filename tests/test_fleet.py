@@ -43,7 +43,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def answers(path: Path) -> dict[str, Any]:
     """By log's name."""
-    return {Path(one["log"]).name: one for one in json.loads(path.read_text())["logs"]}
+    return {Path(log["log"]).name: log for log in json.loads(path.read_text())["logs"]}
 
 
 def test_each_log_is_worked_on_once(
@@ -57,9 +57,11 @@ def test_each_log_is_worked_on_once(
     assert twin(monkeypatch, *asked, second) == 0
     assert "0 of 3 logs done, 3 were known" in capsys.readouterr().out
     before, after = answers(first), answers(second)
-    assert {one["state"] for one in after.values()} == {"known"}
-    assert [one["answer"] for one in before.values()] == [one["answer"] for one in after.values()]
-    verdicts = {name: one["answer"]["verdict"] for name, one in before.items()}
+    assert {result["state"] for result in after.values()} == {"known"}
+    assert [result["answer"] for result in before.values()] == [
+        result["answer"] for result in after.values()
+    ]
+    verdicts = {name: result["answer"]["verdict"] for name, result in before.items()}
     assert verdicts == {
         "A1-0.mcap": "consistent",
         "A2-1.mcap": "consistent",
@@ -94,7 +96,7 @@ def test_a_broken_log_costs_only_itself(
     damaged, foreign, good = (tmp_path / f"{name}.mcap" for name in ("damaged", "foreign", "good"))
     at = len(whole) // 2
     damaged.write_bytes(
-        whole[:at] + bytes(255 - one for one in whole[at : at + 4000]) + whole[at + 4000 :]
+        whole[:at] + bytes(255 - byte for byte in whole[at : at + 4000]) + whole[at + 4000 :]
     )
     foreign.write_text("time,pressure\n")
     good.write_bytes(whole)
@@ -103,7 +105,7 @@ def test_a_broken_log_costs_only_itself(
     assert twin(monkeypatch, *asked, "--json", found, "--html", page) == 3  # as for one log alone
     said = capsys.readouterr()
     assert "1 unit: none stands out, 1 could not be judged; 2 logs could not be used" in said.out
-    assert [one["log"] for one in json.loads(found.read_text())["refused"]] == [
+    assert [refused["log"] for refused in json.loads(found.read_text())["refused"]] == [
         str(damaged),
         str(foreign),
     ]
@@ -234,7 +236,7 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(
         on = ("--engine", "dask", "--scheduler", started.address, "--json", there)
         assert twin(monkeypatch, *asked, tmp_path / "2.sqlite", *on) == 0
         assert started.workers[0].wait(10) == -signal.SIGKILL
-    alike = [{n: one["answer"] for n, one in answers(path).items()} for path in (here, there)]
+    alike = [{n: result["answer"] for n, result in answers(path).items()} for path in (here, there)]
     assert list(alike[0].items()) == list(alike[1].items())  # in the order they were named in
     assert len(alike[0]) == len(UNITS)
     assert "3 of 3 logs done" in capsys.readouterr().out

@@ -50,7 +50,7 @@ def fleet(rng: np.random.Generator, units: int, scatter: float = 2.0) -> list[di
 def diagnosis(verdict: str, *effects: str, rms: float = 1.0) -> dict[str, Any]:
     return {
         "verdict": verdict,
-        "causes": [{"effect": one} for one in effects],
+        "causes": [{"effect": effect} for effect in effects],
         "baseline": {"rms_mbar": rms},
     }
 
@@ -58,7 +58,7 @@ def diagnosis(verdict: str, *effects: str, rms: float = 1.0) -> dict[str, Any]:
 def test_one_that_is_far_from_the_others_is_first() -> None:
     units = fleet(np.random.default_rng(1), 200)
     units[17]["leakage"] = 21.0
-    first, second, *_ = standings([watched(f"U{n}", one) for n, one in enumerate(units)])
+    first, second, *_ = standings([watched(f"U{n}", effects) for n, effects in enumerate(units)])
     assert (first.id, first.effect) == ("U17", "leakage")
     assert first.beyond == pytest.approx(10.0, rel=0.2)  # of the others' two sigmas
     assert first.size == pytest.approx(2.0, rel=0.15)
@@ -68,17 +68,17 @@ def test_one_that_is_far_from_the_others_is_first() -> None:
 def test_what_can_only_grow_does_not_stand_out_by_less() -> None:
     units = fleet(np.random.default_rng(2), 50)
     units[3]["leakage"] = -30.0
-    assert standings([watched(f"U{n}", one) for n, one in enumerate(units)])[0].id != "U3"
+    assert standings([watched(f"U{n}", effects) for n, effects in enumerate(units)])[0].id != "U3"
 
 
 def test_a_unit_is_compared_with_what_it_was() -> None:
     rng = np.random.default_rng(3)
     results = []
-    for number, one in enumerate(fleet(rng, 60, scatter=20.0)):
-        changed = {name: at + rng.normal(0.5, 0.3) for name, at in one.items()}
+    for number, effects in enumerate(fleet(rng, 60, scatter=20.0)):
+        changed = {name: at + rng.normal(0.5, 0.3) for name, at in effects.items()}
         if number == 5:
             changed["sensor_offset"] += 6.0
-        results += [watched(f"U{number}", one), watched(f"U{number}", changed, day=90.0)]
+        results += [watched(f"U{number}", effects), watched(f"U{number}", changed, day=90.0)]
     first, second, *_ = standings(results)
     assert (first.id, first.effect) == ("U5", "sensor_offset")
     assert first.size == pytest.approx(0.6, rel=0.25)
@@ -218,8 +218,8 @@ def test_a_log_that_was_cut_off_never_looks_well(tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "✓" not in text
     assert "Log cut off" in text
-    units = {one["id"]: one for one in found.plain()["units"]}
-    assert {name: one["log_complete"] for name, one in units.items()} == {"U0": True, "U1": False}
+    units = {unit["id"]: unit for unit in found.plain()["units"]}
+    assert {name: unit["log_complete"] for name, unit in units.items()} == {"U0": True, "U1": False}
     assert found.plain()["groups"][0]["log_cut"] == 1
 
 
@@ -238,7 +238,7 @@ def test_one_that_drifts_is_told_with_its_rate() -> None:
             sigmas = {name: float(rng.normal(0.0, 1.0)) for name in EFFECTS}
             sigmas["leakage"] += grows
             results.append(watched(f"U{unit}", sigmas, float(day)))
-    found = report(sorted(results, key=lambda one: one.begin_ns), [], 0)
+    found = report(sorted(results, key=lambda result_of_log: result_of_log.begin_ns), [], 0)
     assert found.rows[0].id == "U7"
     drift = found.rows[0].drifts[0]
     assert drift.effect == "leakage"
@@ -314,7 +314,7 @@ def test_units_that_differ_by_no_more_than_is_known_have_no_spread() -> None:
 def some() -> Report:
     units = fleet(np.random.default_rng(6), 30)
     units[4]["leakage"] = 40.0
-    results = [watched(f"<U{n}>", one) for n, one in enumerate(units)]
+    results = [watched(f"<U{n}>", effects) for n, effects in enumerate(units)]
     return report(results, [calibrated("U1", 35.0, 0.1), calibrated("U2", 35.5, 0.1)], 0)
 
 
@@ -345,7 +345,7 @@ def some_of_all() -> Report:
     rng = np.random.default_rng(6)
     units = fleet(rng, 30)
     units[4]["leakage"] = 40.0
-    results = [watched(f"<U{n}>", one) for n, one in enumerate(units)]
+    results = [watched(f"<U{n}>", effects) for n, effects in enumerate(units)]
     for day in range(0, 200, 10):
         for number in range(FEWEST_PEERS):
             sigmas = {name: float(rng.normal(0.0, 1.0)) for name in EFFECTS}
@@ -363,7 +363,9 @@ def some_of_all() -> Report:
     ]
     records = [calibrated("U1", 35.0, 0.1), calibrated("U2", 35.5, 0.1)]
     refused = [Refused("bad.mcap", "bad.mcap: this is not the log of an ejector")]
-    return report(sorted(results, key=lambda one: one.begin_ns), records, 0, refused)
+    return report(
+        sorted(results, key=lambda result_of_log: result_of_log.begin_ns), records, 0, refused
+    )
 
 
 def test_a_german_page_counts_and_says_why_in_german(tmp_path: Path) -> None:

@@ -84,7 +84,10 @@ def test_ten_cycles_are_those_of_the_twin(
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
 def test_every_effect_acts_as_in_the_twin(effect) -> None:  # type: ignore[no-untyped-def]
     theta, commands = rigs.theta("gripper"), cycles("gripper", 1)
-    values = {one.name: one.neutral(theta) + one.typical for one in effect.parameters}
+    values = {
+        parameter.name: parameter.neutral(theta) + parameter.typical
+        for parameter in effect.parameters
+    }
     with stepped(made("gripper")) as (one,):
         one.begin(**{f"effect__{effect.name}__{key}": value for key, value in values.items()})
         seen = one.run(commands[:-1])
@@ -135,7 +138,7 @@ def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
             effect__filter_clogging__pressure_drop_at_nominal=0.0, effect__suction_loss__loss=0.0
         )
         mended = one.run(commands[:-1])
-    expected, turned = (by_twin(coefficients(one), commands)[1:] for one in (data, other))
+    expected, turned = (by_twin(coefficients(data_set), commands)[1:] for data_set in (data, other))
     assert np.abs(seen - expected).max() < BOUND
     assert np.abs(expected - turned).max() > 10 * BOUND  # their order matters
     assert np.abs(mended - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
@@ -166,8 +169,8 @@ def test_a_mechanism_of_the_data_set_is_in_the_fmu(
 def test_steps_may_be_of_any_length() -> None:
     commands = cycles("gripper", 1)  # all edges at 50 ms
     with stepped(made("gripper"), 3) as (fine, coarse, odd):
-        for one in (fine, coarse, odd):
-            one.begin()
+        for instance in (fine, coarse, odd):
+            instance.begin()
         each = fine.run(commands)
         assert (coarse.run(commands, 50) == each[49::50]).all()
         uneven = []
@@ -330,15 +333,15 @@ def test_types_and_numbers_are_those_of_the_standard(version: int, tmp_path: Pat
     header, own, official = own_and_official(version, tmp_path)
     plain = re.sub(r"/\*.*?\*/", "", own, flags=re.DOTALL)
     types = set(re.findall(rf"\b(fmi{version}\w+)\)?[;(]", plain)) - {"fmi2CallbackFunctions"}
-    types = {one for one in types if re.search(rf"typedef[^;]*\b{one}\b", plain)}
+    types = {name for name in types if re.search(rf"typedef[^;]*\b{name}\b", plain)}
     values = {
         name
         for body in re.findall(r"enum \{(.*?)\}", plain, re.DOTALL)
         for name in re.findall(r"\w+", body)
     }
     assert len(types) > 10 < len(values)
-    lines = [f'printf("{one} %d\\n", (int)sizeof({one}));' for one in sorted(types)]
-    lines += [f'printf("{one} %d\\n", (int)({one}));' for one in sorted(values)]
+    lines = [f'printf("{name} %d\\n", (int)sizeof({name}));' for name in sorted(types)]
+    lines += [f'printf("{name} %d\\n", (int)({name}));' for name in sorted(values)]
     lines += [f"printf(fmi{version}Version);"]
     if version == 2:
         field = "(int)offsetof(fmi2CallbackFunctions, componentEnvironment)"

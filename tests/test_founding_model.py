@@ -31,7 +31,7 @@ def left(name: str) -> Left:
         rms(off(fitted.data, rig().unseen)),
         rms(off(larger(fitted.data), rig().other_volume)),
         fitted.interval("system.leak_sl_min"),
-        fitted.interval(film) if film in [one.name for one in fitted.free] else (0.0, 0.0),
+        fitted.interval(film) if film in [free.name for free in fitted.free] else (0.0, 0.0),
     )
 
 

@@ -28,7 +28,7 @@ def test_an_input_that_takes_too_long_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fuzz, "LONGEST_S", -1.0)
-    assert any("took" in one for one in fuzz.fuzz("ring", 0, tmp_path, seed=5))
+    assert any("took" in line for line in fuzz.fuzz("ring", 0, tmp_path, seed=5))
 
 
 def test_what_is_found_is_kept_with_its_input(
@@ -44,7 +44,7 @@ def test_what_is_found_is_kept_with_its_input(
     with pytest.raises((ZeroDivisionError, IndexError)):
         fragile(Path(path).read_bytes())
     again = fuzz.fuzz("values", 0, tmp_path, seed=6)  # what was kept is tried first
-    assert any(what.partition(" (")[0] in one for one in again)
+    assert any(what.partition(" (")[0] in line for line in again)
 
 
 def test_an_input_that_ends_the_process_is_there_afterwards(

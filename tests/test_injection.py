@@ -250,8 +250,8 @@ def first_and_last(sites: Sequence[Site]) -> list[tuple[int, Callable[[], Except
     """Of each place the first call, which meets a full disk, and the last, which has no memory."""
     first = {site: number for number, site in reversed([*enumerate(sites)])}
     last = {site: number for number, site in enumerate(sites)}
-    return [(one, full_disk) for one in first.values()] + [
-        (one, MemoryError) for one in last.values()
+    return [(call, full_disk) for call in first.values()] + [
+        (call, MemoryError) for call in last.values()
     ]
 
 

@@ -161,7 +161,7 @@ def test_whatever_network_call_of_the_mails_fails_no_mail_is_lost(
         folder.mkdir()
         outlets = begun(configuration(folder, server.port, recipients=two), said)
         outlets.write(NONE, NO_TICKS, leak().said)
-        wait_until(lambda: {one for _, one in server.envelopes} == set(two))
+        wait_until(lambda: {envelope for _, envelope in server.envelopes} == set(two))
         wait_until(lambda: waiting(folder) == 0)
         outlets.close()
         server.close()
@@ -177,5 +177,5 @@ def test_whatever_network_call_of_the_mails_fails_no_mail_is_lost(
     with nothing_left():
         for number in range(asked):
             ids, said = mailed(number)
-            assert [len(ids[one]) for one in two] == [1, 1], number  # at least once, one ID
+            assert [len(ids[name]) for name in two] == [1, 1], number  # at least once, one ID
             assert len(said) in (0, 2), number

@@ -350,7 +350,7 @@ def test_any_course_gives_finite_figures_or_none(
 def any_rows(draw: st.DrawFn) -> Rows:
     """Of any phases, with noise and holes in both signals, and a supply that may fall."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    shape = course((SUCTION, 0.001, 0.0), *((one, n / 1000, 600.0) for one, n in draw(phases)))
+    shape = course((SUCTION, 0.001, 0.0), *((phase, n / 1000, 600.0) for phase, n in draw(phases)))
     count = len(shape.time)
     swing = 300.0 * np.sin(np.arange(count) / draw(st.integers(20, 2000)))
     vacuum = 500.0 + swing + rng.normal(0.0, draw(st.floats(0.0, 100.0)), count)
@@ -584,7 +584,7 @@ def test_a_warning_stands_beyond_its_limit(
 def test_what_is_not_known_warns_of_nothing() -> None:
     assert beyond() == ()
     assert len(CAUTIONS) == 6
-    assert {one.figure for one in CAUTIONS.values()} <= set(FIGURES)
+    assert {caution.figure for caution in CAUTIONS.values()} <= set(FIGURES)
 
 
 def test_the_table_names_every_figure() -> None:

@@ -146,7 +146,7 @@ def unit() -> Unit:
 
 def by_statistic(unit: Unit, *faults: str) -> Any:
     """Features of a record of four cycles, (statistics, columns of a cycle)."""
-    samples = recorded(unit.plc, 4, 5, [parse_fault(one) for one in faults])
+    samples = recorded(unit.plc, 4, 5, [parse_fault(fault) for fault in faults])
     values = features(unit, samples)
     assert values[-1] == 0.0  # the first system
     return values[:-1].reshape(4, 2 * PLACES + 3)
@@ -237,7 +237,7 @@ def test_an_interval_is_as_wide_as_what_is_missed() -> None:
 def test_unseen_mechanisms_are_judged_without_a_record_of_theirs(learned: Learned) -> None:
     records = training()
     found = unlisted_unseen(learned, records)
-    assert len(found) == sum(label(one) == "unlisted" for one in records) == 40
+    assert len(found) == sum(label(record) == "unlisted" for record in records) == 40
     assert not any(found)  # nothing else is unlisted here, so nobody can have learned the word
 
 

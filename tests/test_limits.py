@@ -148,7 +148,7 @@ def watched(
 
 def over_limit(seen: Collect) -> list[bool]:
     """Whether t1 was over its limit, for each complete cycle."""
-    return ["t1_over_limit" in one.data["warnings"] for one in seen.of(Kind.CYCLE)]
+    return ["t1_over_limit" in event.data["warnings"] for event in seen.of(Kind.CYCLE)]
 
 
 class Desk:

@@ -213,7 +213,7 @@ def test_rows_of_a_log_with_holes_stay_marked_and_its_cycles_have_figures(tmp_pa
     assert b"".join(part.tobytes() for part in rows) == holes.tobytes()
     told = twin.open(tmp_path / "a.mcap").cycles()
     assert len(told) >= len(live.of(Kind.CYCLE)) - 1
-    assert sum("t0_measured" in one for one in told) >= len(told) - 1
+    assert sum("t0_measured" in line for line in told) >= len(told) - 1
 
 
 def test_a_gap_of_more_rows_breaks_the_cycle() -> None:

@@ -114,7 +114,7 @@ class Stream:
 
 def children() -> list[psutil.Process]:
     """Those that a test has started: what tests share may have some of its own."""
-    return [one for one in psutil.Process().children() if one not in _SHARED]
+    return [process for process in psutil.Process().children() if process not in _SHARED]
 
 
 @pytest.fixture(autouse=True)

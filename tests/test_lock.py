@@ -178,4 +178,4 @@ def test_a_run_that_writes_nothing_asks_for_no_lock(
     with holding(tmp_path, "compact-ejector-35 gripper-01"):
         assert twin(monkeypatch, "run", config, "--address", "127.0.0.1:1", "--once") == 3
     assert "watched already" not in capsys.readouterr().err  # it got as far as the PLC
-    assert [one.name for one in tmp_path.iterdir() if one.suffix == ".lock"] != []
+    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".lock"] != []

@@ -236,7 +236,7 @@ def test_an_event_was_received_with_the_last_row_that_is_not_later(tmp_path: Pat
     with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
         recorder.write(samples, ticks, events)
     found = [message for message, _ in messages(tmp_path / "a.mcap", "/events")]
-    received = {(one.publish_time - START_NS) // 1000: one.log_time for one in found}
+    received = {(message.publish_time - START_NS) // 1000: message.log_time for message in found}
     assert received == {us: samples["host_ns"][row] for us, row in rows.items()}
 
 

@@ -29,7 +29,7 @@ def door(tmp_path: Path, clock: Clock) -> Authenticator:
 
 
 def acts(folder: Path) -> list[tuple[str, str, str]]:
-    return [(one["what"], one["who"], one["from"]) for one in records(folder)[0]]
+    return [(entry["what"], entry["who"], entry["from"]) for entry in records(folder)[0]]
 
 
 def _wrong(door: Authenticator, count: int, name: str, address: str) -> None:

@@ -90,7 +90,7 @@ def test_lies_over_opcua_end_nothing_and_make_nothing_up() -> None:
             parts += islice(stream, 30)
     rows = np.concatenate([np.empty(0, SAMPLE), *parts])
     good = rows[(rows["quality"] & UNUSABLE) == 0]
-    true = np.array([plc.pressure(int(one)) * 100.0 for one in good["sequence"] % (1 << 32)])
+    true = np.array([plc.pressure(int(number)) * 100.0 for number in good["sequence"] % (1 << 32)])
     np.testing.assert_allclose(good["pressure"], true, rtol=1e-6)
     marked = (rows["quality"][1:] & BREAK) != 0
     assert (marked | (np.diff(rows["sequence"]) == 1)).all()

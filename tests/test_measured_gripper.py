@@ -73,17 +73,17 @@ def test_what_holds_is_read_off_with_its_uncertainty(
     logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     found = [curve(monkeypatch, logs[path.stem], tmp_path)[0] for path in HELD]
-    highest = [one["highest"]["value"] for one in found]
+    highest = [cycle["highest"]["value"] for cycle in found]
     assert highest == pytest.approx([436.3, 446.2, 446.6], abs=0.5)
-    assert all(0.2 < float(one["highest"]["half95"] or 0.0) < 1.0 for one in found)
-    opened = [one["open_cup"]["value"] for one in found]
+    assert all(0.2 < float(cycle["highest"]["half95"] or 0.0) < 1.0 for cycle in found)
+    opened = [cycle["open_cup"]["value"] for cycle in found]
     assert opened == pytest.approx([32.2, 40.9, 40.4], abs=1.0)
-    for one in found:
-        assert one["evacuation"]["value"] == pytest.approx(52.0, abs=10.0)  # in two or three rows
-        assert one["evacuation"]["half95"] == pytest.approx(25.6, abs=0.5)
-        assert one["rate"]["value"] is None
-        assert "too few readings in the evacuation" in str(one["rate"]["why"])
-    last = [one["last"]["value"] for one in found]
+    for cycle in found:
+        assert cycle["evacuation"]["value"] == pytest.approx(52.0, abs=10.0)  # in two or three rows
+        assert cycle["evacuation"]["half95"] == pytest.approx(25.6, abs=0.5)
+        assert cycle["rate"]["value"] is None
+        assert "too few readings in the evacuation" in str(cycle["rate"]["why"])
+    last = [cycle["last"]["value"] for cycle in found]
     assert last == pytest.approx([434.7, 445.2, 288.5], abs=1.0)  # the third loses its hold
 
 
@@ -91,11 +91,11 @@ def test_an_open_cup_that_is_vented_is_read_off_alike_five_times(
     logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     found = curve(monkeypatch, logs["vents"], tmp_path)
-    highest = np.array([one["highest"]["value"] for one in found], float)
+    highest = np.array([cycle["highest"]["value"] for cycle in found], float)
     assert len(highest) == 5
     assert highest.mean() == pytest.approx(56.1, abs=0.3)
     assert np.ptp(highest) < 0.5  # mbar: 0.1 % of what an ejector makes
-    whys = {str(one["evacuation"].get("why")) for one in found}
+    whys = {str(cycle["evacuation"].get("why")) for cycle in found}
     assert whys == {"the record begins in the vacuum"}
 
 
@@ -129,7 +129,7 @@ def test_two_records_are_compared_by_their_curves(
     told = ("--json", tmp_path / "c.json", "--picture", tmp_path / "c.png")
     assert command(monkeypatch, "compare", a, b, *told) == 0
     answer = json.loads((tmp_path / "c.json").read_text())
-    by_name = {one["name"]: one for one in answer["figures"]}
+    by_name = {figure["name"]: figure for figure in answer["figures"]}
     assert by_name["highest"]["difference"] == pytest.approx(9.9, abs=0.5)
     assert by_name["highest"]["low95"] is None  # one suction each: nobody knows the scatter
     assert answer["conclusion"].startswith("Too few cycles to say whether they differ: 1 and 1")
@@ -181,6 +181,6 @@ def test_a_log_of_a_table_says_what_its_pressure_counts_from(
     log, again = tmp_path / "a.mcap", tmp_path / "b.mcap"
     assert command(monkeypatch, "import", file, "--config", config, "-o", log) == 0
     assert command(monkeypatch, "replay", log, "--config", config, "-o", again) == 0
-    for one in (log, again):
-        assert Config.of_recorded(open_log(one).header, one.name).is_gauge == gauge
+    for path in (log, again):
+        assert Config.of_recorded(open_log(path).header, path.name).is_gauge == gauge
     assert twin.open(file, config).config.is_gauge == gauge

@@ -85,8 +85,8 @@ def linked(tmp_path: Path) -> Iterator[Callable[[Callable[[ssl.SSLSocket], None]
         return link
 
     yield link_to
-    for one in opened:
-        one.close()
+    for connection in opened:
+        connection.close()
 
 
 def test_an_answer_comes_in_pieces(linked: Callable[..., ModbusClient]) -> None:
@@ -181,8 +181,8 @@ def test_a_certificate_out_of_date_is_refused(tmp_path: Path, begin_days: int, s
 @pytest.mark.parametrize("known", [True, False])
 def test_a_plc_that_wants_a_certificate_takes_the_one_it_knows(tmp_path: Path, known: bool) -> None:
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    for one in (ours, theirs):
-        certificates.make(one)
+    for place in (ours, theirs):
+        certificates.make(place)
     plc = Plc(tmp_path / "plc", answer, clients=pem(ours if known else theirs))
     own = {"certificate": pem(ours), "key": ours / certificates.KEY}
     with reaching(plc, tmp_path / "plc", **own) as link:

@@ -68,7 +68,7 @@ class At(Bench):
 
 
 def numbers(documents: Sequence[dict[str, Any]]) -> list[int]:
-    return [one["number"] for one in documents if "deed" not in one]
+    return [document["number"] for document in documents if "deed" not in document]
 
 
 def test_the_twin_is_there_until_it_leaves(tmp_path: Path, running: Broker) -> None:
@@ -120,7 +120,10 @@ def test_a_broker_that_lost_everything_is_right_again(tmp_path: Path, running: B
     bench.end()
     with Listener(running.port) as late:
         restated = [late.until(LEAK), late.until("plc_stale")]
-    assert {one["number"]: one["deed"] for one in restated} == {2: "restated", 3: "restated"}
+    assert {document["number"]: document["deed"] for document in restated} == {
+        2: "restated",
+        3: "restated",
+    }
     assert "the connection is lost" in bench.said[0]
     assert bench.said[1] == "alarms go to mqtt again"
 
@@ -137,7 +140,7 @@ def test_a_broker_that_lost_nothing_is_told_nothing_twice(tmp_path: Path, runnin
         bench.end()
         listener.until("status", status="offline", since=None)
         listener.until("status", status="online")
-        assert [one.get("number") for one in listener.on(LEAK)] == [1, 2]
+        assert [document.get("number") for document in listener.on(LEAK)] == [1, 2]
 
 
 def test_a_thousand_changes_wait_through_an_outage(tmp_path: Path, running: Broker) -> None:

@@ -33,15 +33,19 @@ def test_few_rows_say_what_all_of_them_do(
     theta, samples, ticks = beside(name, fault)
     assert len(drawn_rows(samples, ticks)) < 0.3 * len(samples)
     healthy = rigs.config(name).monitor.healthy
-    few = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
+    few = {
+        likeness.effect: likeness for likeness in likenesses(theta, healthy, samples, ticks, BEGIN)
+    }
     monkeypatch.setattr(naming, "drawn_rows", lambda samples, _: np.arange(len(samples)))
     monkeypatch.setattr(kernel, "COARSE_TOLERANCE", kernel.TOLERANCE)
-    every = {one.effect: one for one in likenesses(theta, healthy, samples, ticks, BEGIN)}
+    every = {
+        likeness.effect: likeness for likeness in likenesses(theta, healthy, samples, ticks, BEGIN)
+    }
     assert few.keys() == every.keys() == {*EFFECTS, UNKNOWN}
-    for effect, one in every.items():
-        assert few[effect].share == pytest.approx(one.share, abs=0.01)
-        if one.share > 0.1 and effect != UNKNOWN:
-            assert few[effect].size == pytest.approx(one.size, rel=0.02)
+    for effect, likeness in every.items():
+        assert few[effect].share == pytest.approx(likeness.share, abs=0.01)
+        if likeness.share > 0.1 and effect != UNKNOWN:
+            assert few[effect].size == pytest.approx(likeness.size, rel=0.02)
 
 
 def test_time_that_stands_still_or_jumps_is_drawn() -> None:

@@ -11,7 +11,7 @@ import pytest
 import rigs
 from needs import NEEDS
 
-PROGRAMS = {one for need in NEEDS.values() for one in (*need.programs, *need.aliases)}
+PROGRAMS = {program for need in NEEDS.values() for program in (*need.programs, *need.aliases)}
 
 
 def run_without(need: str, *options: str, ci: str = "") -> "subprocess.CompletedProcess[str]":
@@ -54,12 +54,12 @@ def test_in_ci_a_missing_program_is_a_failure() -> None:
 
 
 def test_a_test_that_names_no_need_finds_no_program() -> None:
-    assert {one for one in {*PROGRAMS, "sh", "git"} if shutil.which(one)} == set()
+    assert {program for program in {*PROGRAMS, "sh", "git"} if shutil.which(program)} == set()
 
 
 @pytest.mark.needs("openssl")
 def test_a_test_finds_the_programs_that_it_names_and_no_other_need() -> None:
-    assert {one for one in PROGRAMS if shutil.which(one)} == {"openssl"}
+    assert {program for program in PROGRAMS if shutil.which(program)} == {"openssl"}
     assert shutil.which("sh"), "programs may call the rest of the system"
 
 
@@ -84,7 +84,7 @@ def test_make_peers_installs_all_packages_of_the_table(
     assert needs.main() == 1
     update, install = bare
     assert update == "apt-get update -q"
-    assert set(install.split()) > {one for need in NEEDS.values() for one in need.packages}
+    assert set(install.split()) > {package for need in NEEDS.values() for package in need.packages}
     assert "mosquitto is missing: alarms" in capsys.readouterr().out
 
 

@@ -32,7 +32,7 @@ NO_TICKS = np.empty(0, TICK)
 
 
 def told(events: Sequence[Event]) -> list[dict[str, Any]]:
-    return [json.loads(one.body) for happened in events for one in of_event(UNIT, happened)]
+    return [json.loads(message.body) for happened in events for message in of_event(UNIT, happened)]
 
 
 # --- what is told -------------------------------------------------------------------------------
@@ -64,10 +64,10 @@ def test_every_change_has_an_id_of_its_own_and_an_episode_keeps_its() -> None:
     stream.at(7)
     stream.at(9, event(9, Kind.DEVIATION_CLEARED))
     bodies = told(stream.said)
-    assert [one["deed"] for one in bodies] == ["raised", "acknowledged", "shelved", "cleared"]
-    assert len({one["id"] for one in bodies}) == 4
-    assert {one["episode"] for one in bodies} == {f"{APART + 5 * S}.{LEAK}"}
-    assert {one["since"] for one in bodies} == {"2001-09-09T01:46:45.000000Z"}
+    assert [body["deed"] for body in bodies] == ["raised", "acknowledged", "shelved", "cleared"]
+    assert len({body["id"] for body in bodies}) == 4
+    assert {body["episode"] for body in bodies} == {f"{APART + 5 * S}.{LEAK}"}
+    assert {body["since"] for body in bodies} == {"2001-09-09T01:46:45.000000Z"}
     assert bodies[1]["who"] == "ann"
     assert bodies[2]["shelved_until"] == "2001-09-09T01:47:47.000000Z"
 
@@ -93,7 +93,7 @@ def test_a_suppression_that_keeps_nothing_quiet_is_not_told() -> None:
     stream.at(7, event(7, Kind.PLC_STALE))
     stream.at(8, event(8, Kind.DEVIATION_CLEARED))
     stream.at(9, event(9, Kind.PLC_BACK))
-    states = [one["state"] for one in told(stream.said) if one["alarm"] == LEAK]
+    states = [body["state"] for body in told(stream.said) if body["alarm"] == LEAK]
     assert states == ["unacknowledged", "acknowledged", "suppressed", "normal"]
 
 
@@ -108,14 +108,14 @@ def test_alarms_that_stand_when_a_run_begins_are_told_as_they_are() -> None:
     stream.at(5, deviation(5))
     stream.at(9, diagnosis(9, 5, "suction_loss"))
     later = Stream(stream.desk.before)
-    bodies = [json.loads(restated(UNIT, one, 0).body) for one in later.alarms.standing()]
-    states = {one["alarm"]: (one["state"], one["since"]) for one in bodies}
+    bodies = [json.loads(restated(UNIT, alarm, 0).body) for alarm in later.alarms.standing()]
+    states = {body["alarm"]: (body["state"], body["since"]) for body in bodies}
     assert states == {
         LEAK: ("normal", None),
         "deviation_suction_loss": ("unacknowledged", "2001-09-09T01:46:45.000000Z"),
     }
-    assert {one["deed"] for one in bodies} == {"restated"}
-    assert {one["evidence"].get("effect") for one in bodies} == {None, "suction_loss"}
+    assert {body["deed"] for body in bodies} == {"restated"}
+    assert {body["evidence"].get("effect") for body in bodies} == {None, "suction_loss"}
 
 
 def test_what_is_told_again_has_its_own_id_and_is_not_announced() -> None:
@@ -155,7 +155,7 @@ def outbox(url: str, clock: Clock) -> Iterator[Outbox]:
 
 def test_messages_wait_for_each_destination_in_order(outbox: Outbox) -> None:
     outbox.put([(to, message(n)) for n in (3, 1, 2) for to in ("mqtt", "webhook")])
-    assert [one.id for one in outbox.next("mqtt", 2)] == ["3", "1"]
+    assert [message.id for message in outbox.next("mqtt", 2)] == ["3", "1"]
     outbox.delivered("mqtt", ["3", "1"])
     assert outbox.next("mqtt", 5) == [message(2)]
     assert (outbox.count("mqtt"), outbox.count("webhook")) == (1, 3)
@@ -196,11 +196,11 @@ def test_people_see_what_waits_and_send_again_what_was_refused(run: Any, tmp_pat
 def test_it_holds_a_number_of_messages_for_a_time(outbox: Outbox, clock: Clock) -> None:
     outbox.put([("mqtt", message(n)) for n in range(5)])
     assert outbox.give_up("mqtt", 5, 0) == []
-    assert [one.id for one in outbox.give_up("mqtt", 3, 0)] == ["0", "1"]
+    assert [message.id for message in outbox.give_up("mqtt", 3, 0)] == ["0", "1"]
     outbox.refuse("mqtt", "2", "no")
     clock.ns += 10
     outbox.put([("mqtt", message(9))])
-    assert [one.id for one in outbox.give_up("mqtt", 3, clock.ns)] == ["3", "4"]
+    assert [message.id for message in outbox.give_up("mqtt", 3, clock.ns)] == ["3", "4"]
     assert outbox.refused("mqtt") == []
     assert outbox.next("mqtt", 5) == [message(9)]
 
@@ -233,12 +233,12 @@ class Fake:
     def send(self, messages: Sequence[Message], topic: str = sender.ALARM) -> Sent:
         sent = Sent()
         self.topics.append(topic)
-        for one in messages[: self.most]:
-            if why := self.take(one):
-                sent.refused[one.id] = why
+        for message in messages[: self.most]:
+            if why := self.take(message):
+                sent.refused[message.id] = why
             else:
-                self.taken.append(one)
-                sent.delivered.append(one)
+                self.taken.append(message)
+                sent.delivered.append(message)
         if len(messages) > self.most:
             sent.lost, self.most = LostError("it went away"), 10**9
         return sent
@@ -266,7 +266,7 @@ class Bench:
         )
 
     def put(self, *messages: Message) -> None:
-        self.outbox.put([("mqtt", one) for one in messages])
+        self.outbox.put([("mqtt", message) for message in messages])
         self.sender.wake()
 
     def settled(self) -> list[str]:
@@ -274,7 +274,7 @@ class Bench:
         wait_until(lambda: self.outbox.count("mqtt") == 0)
         self.channel.idle_now.clear()
         assert self.channel.idle_now.wait(10.0)
-        return [one.id for one in self.channel.taken]
+        return [message.id for message in self.channel.taken]
 
     def end(self) -> None:
         self.sender.end()
@@ -344,11 +344,11 @@ def test_pauses_grow_and_begin_anew(bench: Bench, monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_is_refused_does_not_hold_up_others(bench: Bench) -> None:
-    bench.channel.take = lambda one: "status 400" if one.id in ("1", "3") else ""
+    bench.channel.take = lambda message: "status 400" if message.id in ("1", "3") else ""
     bench.put(*(message(n) for n in range(5)))
     bench.sender.start()
     assert bench.settled() == ["0", "2", "4"]
-    assert [one.id for one, _ in bench.outbox.refused("mqtt")] == ["1", "3"]
+    assert [message.id for message, _ in bench.outbox.refused("mqtt")] == ["1", "3"]
     assert bench.said == ["mqtt refuses alarms, which are set aside: status 400"]
 
 
@@ -361,10 +361,10 @@ def test_who_has_forgotten_everything_is_told_the_newest_of_each(bench: Bench) -
     bench.put(message(4))
     bench.settled()
     wait_until(lambda: len(bench.channel.taken) == 6)
-    assert [one.id for one in bench.channel.taken[:4]] == ["1", "2", "3", "4"]
-    told_again = [json.loads(one.body) for one in bench.channel.taken[4:]]
-    assert [one["number"] for one in told_again] == [4, 2]
-    assert len({one["id"] for one in told_again} | {"1", "2", "3", "4"}) == 6
+    assert [message.id for message in bench.channel.taken[:4]] == ["1", "2", "3", "4"]
+    told_again = [json.loads(message.body) for message in bench.channel.taken[4:]]
+    assert [body["number"] for body in told_again] == [4, 2]
+    assert len({body["id"] for body in told_again} | {"1", "2", "3", "4"}) == 6
 
 
 def test_beyond_its_bounds_the_oldest_are_given_up_and_that_is_said(
@@ -378,7 +378,9 @@ def test_beyond_its_bounds_the_oldest_are_given_up_and_that_is_said(
     (said,) = bench.said
     assert said.startswith("11 changes of alarms were never delivered to mqtt")
     wait_until(lambda: len(bench.channel.taken) == 102)  # what it would not know else
-    again_ = {one.alarm: json.loads(one.body)["number"] for one in bench.channel.taken[100:]}
+    again_ = {
+        message.alarm: json.loads(message.body)["number"] for message in bench.channel.taken[100:]
+    }
     assert again_ == {"plc_stale": 0, LEAK: 110}
 
 
@@ -427,10 +429,10 @@ def test_a_sender_goes_on_after_a_defect(bench: Bench, monkeypatch: pytest.Monke
     monkeypatch.setattr(bench.sender, "_backoff", Backoff(0.001, 0.001))
     take, failures = bench.channel.take, iter([ValueError("a defect"), MemoryError()])
 
-    def fall(one: Message) -> str:
+    def fall(message: Message) -> str:
         for error in failures:
             raise error
-        return take(one)
+        return take(message)
 
     bench.channel.take = fall
     bench.put(message(1))
@@ -457,8 +459,11 @@ def test_changes_are_in_the_outbox_before_they_are_delivered(tmp_path: Path) -> 
         outlets.begin(Stream(stream.desk.before).alarms.standing())
         outlets.write(NONE, NO_TICKS, stream.said)
         outlets.close()
-    bodies = [json.loads(one.body) for one in channel.taken]
-    assert [(one["alarm"], one["deed"]) for one in bodies] == [(LEAK, "restated"), (LEAK, "raised")]
+    bodies = [json.loads(message.body) for message in channel.taken]
+    assert [(body["alarm"], body["deed"]) for body in bodies] == [
+        (LEAK, "restated"),
+        (LEAK, "raised"),
+    ]
     assert min(seen) >= 1
     assert said == []
 
@@ -503,8 +508,8 @@ def test_what_there_is_no_room_for_is_counted(monkeypatch: pytest.MonkeyPatch) -
         UNIT, opened, [Sender("mqtt", Fake(), opened, Outlet(), said.append)], said.append
     )
     outlets.write(NONE, NO_TICKS, stream.said * 5)
-    for one in outlets._senders:
-        one.start()
+    for worker in outlets._senders:
+        worker.start()
     outlets._thread.start()
     outlets.close()
     assert "5 messages could not be put into the outbox" in said

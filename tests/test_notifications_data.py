@@ -41,7 +41,7 @@ def cycle(number: int, **more: Any) -> Event:
 
 
 def bodies(messages: Sequence[Message]) -> list[dict[str, Any]]:
-    return [json.loads(one.body) for one in messages]
+    return [json.loads(message.body) for message in messages]
 
 
 # --- what is told -------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_what_waits_beside_alarms_is_bounded_by_time_and_number(outbox: Outbox) 
     assert outbox.forget("mqtt values", 5, 0) == 1, "of two that go one was refused"
     assert outbox.refused("mqtt values") == []
     assert outbox.forget("mqtt values", 10, clock.ns) == 1
-    assert [one.id for one in outbox.next("mqtt values", 9)] == ["3", "4", "5", "6"]
+    assert [message.id for message in outbox.next("mqtt values", 9)] == ["3", "4", "5", "6"]
     assert outbox.count("mqtt") == 1
 
 
@@ -158,7 +158,7 @@ class Laned(Bench):
         )
 
     def put_data(self, topic: str, *messages: Message) -> None:
-        self.outbox.put([(box_of("mqtt", topic), one) for one in messages])
+        self.outbox.put([(box_of("mqtt", topic), message) for message in messages])
 
 
 def test_alarms_pass_what_waits_beside_them(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_alarms_pass_what_waits_beside_them(tmp_path: Path) -> None:
     bench.sender.start()
     wait_until(lambda: len(bench.channel.taken) == 32)
     assert bench.channel.topics == ["alarm", CYCLE, VALUES, VALUES]
-    assert [one.id for one in bench.channel.taken[:3]] == ["1", "50", "100"]
+    assert [message.id for message in bench.channel.taken[:3]] == ["1", "50", "100"]
     bench.end()
 
 
@@ -190,7 +190,7 @@ def test_while_nobody_takes_it_the_newest_hours_are_kept_and_the_rest_is_counted
     assert bench.said.count(told) == 1
     bench.channel.down = False
     wait_until(lambda: len(bench.channel.taken) == 71)
-    assert [one.id for one in bench.channel.taken] == [str(n) for n in range(29, 100)]
+    assert [message.id for message in bench.channel.taken] == [str(n) for n in range(29, 100)]
     lost = "29 messages with values were never delivered to mqtt and are given up"
     wait_until(lambda: lost in bench.said)
     bench.end()
@@ -220,14 +220,14 @@ def test_no_cycle_is_lost_while_the_broker_is_away(tmp_path: Path) -> None:
     first.write(NONE, NO_TICKS, [cycle(n) for n in range(300)])
     first.write(*rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 7.0)[0]]), [])
     first.close()
-    assert any(one.startswith("302 messages to mqtt wait for the next run") for one in said)
+    assert any(line.startswith("302 messages to mqtt wait for the next run") for line in said)
     with away, Listener(away.port) as listener:
         second = begun()
         second.write(NONE, NO_TICKS, [cycle(n) for n in range(300, 310)])
         listener.until("/cycle", cycle=309)
         second.close()
         online = listener.until("/status", status="offline")
-        assert [one["cycle"] for one in listener.on("/cycle")] == list(range(310))
+        assert [document["cycle"] for document in listener.on("/cycle")] == list(range(310))
         rows = [row for body in listener.on("/values") for row in body["rows"]]
         assert sum(row["samples"] for row in rows) == len(rigs.recorded("gripper", 7.0)[0])
     assert online["asset"] == ASSET

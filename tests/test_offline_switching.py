@@ -62,7 +62,9 @@ def off_at(ms: Floats, at: float, rises: float = 0.02) -> Floats:
 def times(found: list[Switching], on: bool) -> Floats:
     """Ms since suction began in each cycle."""
     length = IDLE_MS + SUCTION_MS
-    return np.array([1e3 * one.time % length - IDLE_MS for one in found if one.on == on])
+    return np.array(
+        [1e3 * switching.time % length - IDLE_MS for switching in found if switching.on == on]
+    )
 
 
 # Kinds that the old finder was lost on; seeds of the second world that no one designed with.
@@ -98,7 +100,7 @@ def test_on_the_shipped_rigs_it_is_found_as_well(name: str, faults: tuple[str, .
     seen = [row for row in rows if suction[row : row + 60].all()]
     assert len(seen) >= 2
     for kind in (False, True):
-        shown = np.array([one.row for one in found if one.on == kind] or [-1000])
+        shown = np.array([switching.row for switching in found if switching.on == kind] or [-1000])
         assert all(np.abs(shown - row).min() <= 20 for row in seen if on[row] == kind)
         true = np.array([row for row in rows if on[row] == kind] or [-1000])
         assert all(np.abs(true - row).min() <= 20 for row in shown)
@@ -177,8 +179,8 @@ def test_rows_that_are_missing_or_bad_say_nothing() -> None:
     samples = samples[rng.random(len(samples)) > 0.05]
     found = switched(samples)
     assert times(found, on=False) == pytest.approx([450.0] * CYCLES, abs=5.0)
-    assert [samples["time_ns"][one.row] for one in found] == pytest.approx(
-        [1e9 * one.time for one in found], abs=2e6
+    assert [samples["time_ns"][switching.row] for switching in found] == pytest.approx(
+        [1e9 * switching.time for switching in found], abs=2e6
     )
 
 
@@ -188,7 +190,7 @@ def test_noise_is_read_with_hum_and_the_converters_steps() -> None:
     white = rng.normal(0.0, 30.0, len(ms))
     hum = 200.0 * np.sin(2.0 * np.pi * ms / 20.0)
     quiet, loud = (
-        Noise.of(1e5 + one, np.empty(0), 1e-3, np.empty(0)) for one in (white, white + hum)
+        Noise.of(1e5 + noise, np.empty(0), 1e-3, np.empty(0)) for noise in (white, white + hum)
     )
     assert quiet.single == pytest.approx(30.0, rel=0.15)
     assert not quiet.hum
@@ -207,7 +209,7 @@ def test_the_model_runs_on_where_the_nozzle_was_found_to_switch(name: str) -> No
     inside = np.isin(cycles.phase, (Phase.SUCTION, Phase.HOLD))
     changes = (np.diff(cycles.phase) != 0) & inside[1:] & inside[:-1]
     rows = np.flatnonzero(changes) + 1
-    assert rows.tolist() == [one.row for one in found]
+    assert rows.tolist() == [switching.row for switching in found]
     assert not np.isfinite(cycles.level[rows]).any()
 
 

@@ -82,7 +82,7 @@ def assert_nothing_made_up(rig: Rig, samples: Samples) -> None:
     said = samples["quality"] & (Quality.BAD | Quality.STALE)
     good = samples[said == 0]
     scan = good["sequence"] % (1 << 32)
-    true = np.array([rig.server.pressure(int(one)) * 100 for one in scan])
+    true = np.array([rig.server.pressure(int(number)) * 100 for number in scan])
     # A server may truly hold other pressures; then they are all what was put there.
     put = np.isin(good["pressure"], [700.0])
     assert (np.isclose(good["pressure"], true) | put).all()
@@ -119,7 +119,7 @@ changes = st.lists(st.tuples(st.integers(-1, 5), st.integers(-50, 50), values, c
 @given(st.lists(changes, max_size=5))
 def test_whatever_is_published_is_rows_or_one_clear_error(parts: list[list[Any]]) -> None:
     sent = [
-        publication([raw_change(*one) for one in part], number)
+        publication([raw_change(*change) for change in part], number)
         for number, part in enumerate(parts, 1)
     ]
     rows: list[Samples] = [EMPTY]

@@ -35,17 +35,17 @@ def put(into: Item, *values: float) -> None:
 def test_a_full_queue_loses_the_oldest_and_says_so() -> None:
     full, queue = item(3, always=True)
     put(full, 1.0, 2.0, 3.0)
-    assert not any(lost_some(one.Value.StatusCode.value) for one in queue)
+    assert not any(lost_some(item.Value.StatusCode.value) for item in queue)
     put(full, 4.0, 5.0)
-    assert [one.Value.Value.Value for one in queue] == [3.0, 4.0, 5.0]
-    assert [lost_some(one.Value.StatusCode.value) for one in queue] == [True, False, False]
-    assert {one.ClientHandle for one in queue} == {2}
+    assert [item.Value.Value.Value for item in queue] == [3.0, 4.0, 5.0]
+    assert [lost_some(item.Value.StatusCode.value) for item in queue] == [True, False, False]
+    assert {item.ClientHandle for item in queue} == {2}
 
 
 def test_equal_values_are_queued_only_if_asked_for() -> None:
     changes, queue = item(9, always=False)
     put(changes, 1.0, 1.0, 2.0, 2.0, 1.0)
-    assert [one.Value.Value.Value for one in queue] == [1.0, 2.0, 1.0]
+    assert [item.Value.Value.Value for item in queue] == [1.0, 2.0, 1.0]
     every, queue = item(9, always=True)
     put(every, 1.0, 1.0)
     assert len(queue) == 2

@@ -151,7 +151,7 @@ def test_over_the_wire_the_address_is_told_and_a_removed_user_reads_no_more(user
 
     asyncio.run(talk())
     assert said == []
-    told = [(one["what"], one["who"], one["from"]) for one in records(users.path.parent)[0]]
+    told = [(entry["what"], entry["who"], entry["from"]) for entry in records(users.path.parent)[0]]
     assert told == [
         ("wrong_password", "Schlüssel", "127.0.0.1"),
         ("logged_in", "Schlüssel", "127.0.0.1"),

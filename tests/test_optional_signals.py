@@ -179,8 +179,8 @@ def test_reports_come_as_late_as_their_cycle_says() -> None:
         {"rig": {"vessel_ml": 50.0}, "reports": {"bits": True, "bits_delay_ms": 8}}
     )
     plain, at_once, later = (
-        np.concatenate([block for block, _ in with_truth(one, 4.0, block=333)])
-        for one in (rig, told, late)
+        np.concatenate([block for block, _ in with_truth(settings, 4.0, block=333)])
+        for settings in (rig, told, late)
     )
     assert (plain["pressure"] == at_once["pressure"]).all()
     assert not plain["reported"].any()

@@ -18,7 +18,7 @@ from twin.signals import MBAR, MS, NS, Phase, Samples, Ticks
 Floats = npt.NDArray[np.float64]
 SECONDS = {"test_rig": 100.0, "gripper": 60.0}
 # In no pressure does a threshold show: the switching is given to the hypotheses.
-SHOWN = [1 + i for i, one in enumerate(SUSPECTS) if one.effect != "threshold_drift"]
+SHOWN = [1 + i for i, suspect in enumerate(SUSPECTS) if suspect.effect != "threshold_drift"]
 MS_NS = round(MS / NS)
 
 
@@ -310,11 +310,11 @@ def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
         assert len(bank._drawings) <= KEPT
         before = later(known, other)
         bank.take(before)  # used each time
-    kept = [one.stretches.how[0, 0] for one in bank._drawings._kept]
+    kept = [drawing.stretches.how[0, 0] for drawing in bank._drawings._kept]
     first = int(np.sum(known.ticks["phase"] == Phase.SUCTION)) - 1
     assert first in kept
     assert sorted(kept)[1:] == [first + 30 * (2 * KEPT - n) for n in reversed(range(KEPT - 1))]
-    assert all(len(one.drawn) <= LONGEST_PIECE for one in bank._drawings._kept)
+    assert all(len(drawing.drawn) <= LONGEST_PIECE for drawing in bank._drawings._kept)
     assert bank._seen == len(bank._expected) == 0
 
 

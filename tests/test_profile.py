@@ -39,7 +39,7 @@ def test_of_another_model_it_is_where_the_best_of_the_other_size_has_the_rise() 
     data = decay(truth)
 
     def misfit(points: Floats) -> Floats:
-        return np.array([np.sum((decay(one) - data) ** 2) / sigma**2 for one in points])
+        return np.array([np.sum((decay(point) - data) ** 2) / sigma**2 for point in points])
 
     moved = [(decay(truth + step) - data) / 1e-5 for step in 1e-5 * np.eye(2)]
     jacobian = np.stack(moved, axis=1) / sigma

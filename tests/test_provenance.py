@@ -38,23 +38,23 @@ def files(folder: Path) -> Iterator[Path]:
 
 def our_files() -> list[Path]:
     """All of the tree but LICENSE, whose text is meant to be everybody's."""
-    roots = [one for one in ROOT.iterdir() if one.is_file() and one.name != "LICENSE"]
-    return [*roots, *(one for folder in FOLDERS for one in files(ROOT / folder))]
+    roots = [file for file in ROOT.iterdir() if file.is_file() and file.name != "LICENSE"]
+    return [*roots, *(file for folder in FOLDERS for file in files(ROOT / folder))]
 
 
 def copies(ours: list[Path], installed: Path) -> dict[str, str]:
     """Which files are byte by byte those of an installed package."""
     sizes: dict[int, list[Path]] = {}
-    for one in ours:
-        if one.stat().st_size >= TINY:
-            sizes.setdefault(one.stat().st_size, []).append(one)
+    for file in ours:
+        if file.stat().st_size >= TINY:
+            sizes.setdefault(file.stat().st_size, []).append(file)
     found = {}
     for other in files(installed):
         if other.relative_to(installed).parts[0].startswith("ejector_twin-"):
             continue
-        for one in sizes.get(other.stat().st_size, []):
-            if digest(one) == digest(other):
-                found[str(one)] = str(other)
+        for same_size in sizes.get(other.stat().st_size, []):
+            if digest(same_size) == digest(other):
+                found[str(same_size)] = str(other)
     return found
 
 
@@ -99,11 +99,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]
 
 def test_a_wheel_has_the_packages_whole_and_one_licence(wheel: zipfile.ZipFile) -> None:
     inside = [*files(ROOT / "twin"), *files(ROOT / "drivers")]
-    expected = {one.relative_to(ROOT).as_posix() for one in inside}
-    expected |= {f"twin/starters/{one.name}" for one in (ROOT / "configs").glob("*.toml")}
+    expected = {file.relative_to(ROOT).as_posix() for file in inside}
+    expected |= {f"twin/starters/{file.name}" for file in (ROOT / "configs").glob("*.toml")}
     shipped = set(wheel.namelist())
-    (metadata,) = (one for one in shipped if one.endswith(".dist-info/METADATA"))
-    assert {one for one in shipped if ".dist-info/" not in one} == expected
+    (metadata,) = (name for name in shipped if name.endswith(".dist-info/METADATA"))
+    assert {name for name in shipped if ".dist-info/" not in name} == expected
     told = BytesParser().parsebytes(wheel.read(metadata))
     assert told["License-Expression"] == "Apache-2.0"
     assert told.get_all("License-File") == ["LICENSE"]
@@ -113,7 +113,7 @@ def test_a_wheel_has_the_packages_whole_and_one_licence(wheel: zipfile.ZipFile) 
 
 def test_measured_data_says_whose_it_is_and_is_not_distributed() -> None:
     page = (ROOT / "tests" / "data" / "README.md").read_text(encoding="utf-8")
-    for folder in (one for one in (ROOT / "tests" / "data").iterdir() if one.is_dir()):
+    for folder in (folder for folder in (ROOT / "tests" / "data").iterdir() if folder.is_dir()):
         (row,) = (line for line in page.splitlines() if f"`{folder.name}/` |" in line)
         assert row.rstrip(" |").endswith("MIT"), row
 
@@ -123,9 +123,9 @@ def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> 
         patch.chdir(ROOT)
         name = hatchling.build.build_sdist(str(tmp_path))
     with tarfile.open(tmp_path / name) as archive:
-        inside = {one.name.split("/", 1)[1] for one in archive if one.isfile()}
+        inside = {member.name.split("/", 1)[1] for member in archive if member.isfile()}
     assert "twin/starters/test_rig.toml" in inside
-    others = {one for one in inside if not one.startswith(("twin/", "drivers/"))}
+    others = {name for name in inside if not name.startswith(("twin/", "drivers/"))}
     assert others == {".gitignore", "LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
 
 
@@ -160,11 +160,11 @@ NEEDS_EXTRA = {
     "twin/view.py": "view",
 }
 
-NEIGHBOURS = {one.stem for folder in ("tests", "tools") for one in (ROOT / folder).iterdir()}
+NEIGHBOURS = {file.stem for folder in ("tests", "tools") for file in (ROOT / folder).iterdir()}
 
 
 def declared(requirements: list[str]) -> set[str]:
-    return {canonicalize_name(Requirement(one).name) for one in requirements}
+    return {canonicalize_name(Requirement(requirement).name) for requirement in requirements}
 
 
 @cache
@@ -174,12 +174,12 @@ def imported(path: Path) -> list[tuple[str, int]]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
-            names = [one.name for one in node.names]
+            names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             names = [str(node.module)]
         elif is_named_import(node):
             names = [node.args[0].value]  # type: ignore[attr-defined]
-        for name in (one.partition(".")[0] for one in names):
+        for name in (name.partition(".")[0] for name in names):
             if name not in sys.stdlib_module_names and name not in OURS:
                 found.append((name, node.lineno))  # type: ignore[attr-defined]
     return found
@@ -201,7 +201,7 @@ def undeclared(path: Path, allowed: set[str], providers: Mapping[str, list[str]]
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for name, line in imported(path)
         if not (name in NEIGHBOURS and path.relative_to(ROOT).parts[0] in ("tests", "tools"))
-        if not allowed & {canonicalize_name(one) for one in providers.get(name, [])}
+        if not allowed & {canonicalize_name(provider) for provider in providers.get(name, [])}
     ]
 
 
@@ -217,9 +217,11 @@ def allowed_for(path: Path) -> set[str]:
 
 def test_what_is_imported_is_declared_where_it_is_needed() -> None:
     providers = packages_distributions()
-    modules = [one for folder in OURS for one in files(ROOT / folder) if one.suffix == ".py"]
+    modules = [file for folder in OURS for file in files(ROOT / folder) if file.suffix == ".py"]
     assert len(modules) > 300
-    assert [bad for one in modules for bad in undeclared(one, allowed_for(one), providers)] == []
+    assert [
+        bad for module in modules for bad in undeclared(module, allowed_for(module), providers)
+    ] == []
 
 
 def test_what_is_declared_is_imported() -> None:

@@ -54,11 +54,11 @@ def test_every_command_and_option_is_on_the_page() -> None:
     text = page("commands.md")
     count = 0
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
-        for below, one in getattr(command, "commands", {"": command}).items():
+        for below, subcommand in getattr(command, "commands", {"": command}).items():
             title = f"twin {name} {below}".strip()
             match = re.search(rf"^##+ {title}\n(.*?)(?=^##|\Z)", text, re.DOTALL | re.MULTILINE)
             assert match is not None, title
-            for option in one.params:
+            for option in subcommand.params:
                 count += 1
                 names = option.opts if option.param_type_name == "option" else [option.metavar]
                 assert all(str(it).replace("|", r"\|") in match[1] for it in names if it), title

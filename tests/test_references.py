@@ -65,7 +65,7 @@ def prose(name: str) -> str:
 
 def spans(name: str) -> list[str]:
     """What stands between single backticks in a page, in one line."""
-    return [" ".join(one.split()) for one in re.findall(r"`([^`]+)`", prose(name))]
+    return [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose(name))]
 
 
 def blocks(name: str, *languages: str) -> list[str]:
@@ -119,7 +119,7 @@ def top_names(path: str) -> set[str]:
             found.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found |= {one.id for one in targets if isinstance(one, ast.Name)}
+            found |= {target.id for target in targets if isinstance(target, ast.Name)}
     return found
 
 
@@ -176,8 +176,10 @@ def check_line(line: str, whole: bool) -> None:
         raise AssertionError(f"twin {line}: {error}") from error
     assert left == [], f"twin {line}: too many arguments"
     if whole and "--help" not in words:
-        needed = [one for one in command.params if one.required]
-        assert [one.name for one in needed if not given.get(one.name or "")] == [], f"twin {line}"
+        needed = [parameter for parameter in command.params if parameter.required]
+        assert [
+            parameter.name for parameter in needed if not given.get(parameter.name or "")
+        ] == [], f"twin {line}"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -350,8 +352,8 @@ def test_options_that_are_named_alone_are_those_of_a_command_or_a_tool() -> None
 def options_of(command: Any) -> Iterator[str]:
     for below in getattr(command, "commands", {}).values():
         yield from options_of(below)
-    for one in command.params:
-        yield from (*one.opts, *one.secondary_opts)
+    for parameter in command.params:
+        yield from (*parameter.opts, *parameter.secondary_opts)
 
 
 # --- the rest -------------------------------------------------------------------------------------
@@ -382,4 +384,4 @@ def test_json_examples_are_json(name: str) -> None:
 def test_the_readme_says_what_each_package_is_for() -> None:
     packages = {path.parent.relative_to(ROOT) for path in ROOT.glob("twin/*/__init__.py")}
     told = set(re.findall(r"`(twin/\w+)/`", text_of("README.md")))
-    assert {str(one) for one in packages} == told
+    assert {str(package) for package in packages} == told

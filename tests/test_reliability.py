@@ -38,7 +38,7 @@ def test_an_alarm_states_its_first_name_and_none_where_nothing_is_named(tmp_path
     named = Watched("first", "gripper", 7, "leakage=2", "leakage", 3, ["a", "leakage"], [0.6, 0.9])
     silent = replace(named, seed=5, alarms=0, names=[], probabilities=[])
     path = tmp_path / "live.jsonl"
-    lines = [json.dumps({"commit": "abc", **asdict(one)}) for one in (named, silent)]
+    lines = [json.dumps({"commit": "abc", **asdict(case)}) for case in (named, silent)]
     path.write_text("\n".join(lines), encoding="utf-8")
     assert list(live(path)) == [Run("live", "first", "abc", 5, [(0.6, False)])]
 

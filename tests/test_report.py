@@ -246,9 +246,9 @@ def laid(verdict: str) -> Laid:
     return laid_over(evidence(), acting(found(verdict)))
 
 
-def page_of(one: Diagnosis, folder: Path) -> str:
+def page_of(diagnosis: Diagnosis, folder: Path) -> str:
     path = folder / "report.html"
-    write_report(one, path)
+    write_report(diagnosis, path)
     return path.read_text(encoding="utf-8")
 
 
@@ -486,8 +486,8 @@ def german(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         "insufficient": insufficient(),
     }
     pages = {}
-    for verdict, one in diagnoses.items():
-        write_report(one, folder / "a.html", language_of("de", "language"))
+    for verdict, answered in diagnoses.items():
+        write_report(answered, folder / "a.html", language_of("de", "language"))
         pages[verdict] = (folder / "a.html").read_text(encoding="utf-8")
     return pages
 

@@ -97,7 +97,7 @@ def test_a_nozzle_that_is_reported_on_stays_on() -> None:
 
 def found_in_record(samples: Samples) -> list[int]:
     rows, told, _ = commanded(samples, (0.0, 0.0))
-    return [one.row for one in switchings(rows, told, noise_of(rows, told))]
+    return [switching.row for switching in switchings(rows, told, noise_of(rows, told))]
 
 
 @pytest.mark.parametrize("late_ms", [0.0, 15.0])

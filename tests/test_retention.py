@@ -115,7 +115,7 @@ class Folder:
 
     @property
     def there(self) -> list[str]:
-        return sorted(one.name for one in self.path.iterdir())
+        return sorted(file.name for file in self.path.iterdir())
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ def test_only_finished_logs_of_the_unit_that_a_run_wrote_are_deleted(many: Folde
     before = many.there
     many.retention.look()
     assert set(before) - set(many.there) == {"old.mcap", "crashed.mcap"}
-    assert [one.split(" (")[0] for one in many.told] == [
+    assert [line.split(" (")[0] for line in many.told] == [
         "crashed.mcap is deleted",
         "old.mcap is deleted",
     ]

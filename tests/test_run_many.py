@@ -258,9 +258,9 @@ def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
         third = configured(tmp_path, "gripper", "far/away", on(other.port))
         logs = [tmp_path / f"run.{name}.mcap" for name in ("test_rig", "gripper", "far_away")]
         with running(*beside, third, "--log", log) as process:
-            until(process, lambda: all(rows(one) > 500 for one in logs))
+            until(process, lambda: all(rows(path) > 500 for path in logs))
             connections = psutil.Process(process.pid).net_connections(kind="tcp")
-            reached = [one.raddr.port for one in connections if one.raddr]
+            reached = [connection.raddr.port for connection in connections if connection.raddr]
             assert sorted(reached) == sorted([plc.port, other.port])
             other.kill()
             until(process, lambda: Kind.PLC_STALE in kinds(open_log(logs[2])))
@@ -270,15 +270,15 @@ def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
                 process.send_signal(signal.SIGINT)
                 said, complaints = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 130, complaints
-    opened = [open_log(one) for one in logs]
-    assert all(one.complete for one in opened)
-    assert [one.header.asset_id for one in opened] == ["test_rig", "gripper", "far/away"]
-    for one in opened[:2]:
-        assert kinds(one) <= {Kind.CYCLE, Kind.CLOCK}
-        assert not any((samples["quality"] & BREAK).any() for samples, _ in one.blocks())
+    opened = [open_log(path) for path in logs]
+    assert all(log.complete for log in opened)
+    assert [log.header.asset_id for log in opened] == ["test_rig", "gripper", "far/away"]
+    for healthy in opened[:2]:
+        assert kinds(healthy) <= {Kind.CYCLE, Kind.CLOCK}
+        assert not any((samples["quality"] & BREAK).any() for samples, _ in healthy.blocks())
     assert "far_away  alarm    plc_stale" in said
     assert "test_rig  info     cycle" in said
-    assert len({one.header.metadata["data_set"] for one in opened}) == 2
+    assert len({log.header.metadata["data_set"] for log in opened}) == 2
 
 
 def over_opcua(url: str, prefix: str, unit: int) -> Callable[[dict[str, Any]], None]:
@@ -312,16 +312,16 @@ def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
         url = plc.process.stdout.readline().strip().removeprefix("OPC UA on ")
         logs = [tmp_path / f"run.{name}.mcap" for name in names]
         with running(*at(url), "--log", tmp_path / "run.mcap") as process:
-            until(process, lambda: all(rows(one) > 1500 for one in logs))
+            until(process, lambda: all(rows(path) > 1500 for path in logs))
             process.send_signal(signal.SIGINT)
             _, complaints = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 130, complaints
-    for name, one in zip(names, map(open_log, logs), strict=True):
-        assert one.complete
-        assert one.header.asset_id == name
-        assert kinds(one) <= {Kind.CYCLE, Kind.CLOCK}
-        assert not any((samples["quality"] & BREAK).any() for samples, _ in one.blocks())
-    left, right = (np.concatenate([rows for rows, _ in open_log(one).blocks()]) for one in logs)
+    for name, log in zip(names, map(open_log, logs), strict=True):
+        assert log.complete
+        assert log.header.asset_id == name
+        assert kinds(log) <= {Kind.CYCLE, Kind.CLOCK}
+        assert not any((samples["quality"] & BREAK).any() for samples, _ in log.blocks())
+    left, right = (np.concatenate([rows for rows, _ in open_log(path).blocks()]) for path in logs)
     _, *same = np.intersect1d(left["sequence"], right["sequence"], return_indices=True)
     assert len(same[0]) > 1000  # scans that both have
     alike = left["pressure"][same[0]] == right["pressure"][same[1]]

@@ -214,7 +214,7 @@ def test_the_second_pressure_is_that_of_the_end_where_it_is_measured() -> None:
         second = Cycles.found(samples, data).of_second(end)
         other = Cycles.found(samples, data).of_second("vessel" if end == "port" else "port")
         theta = coefficients(data).reshape(-1, 1)
-        right, wrong = (np.abs(one.off(theta)).max() for one in (second, other))
+        right, wrong = (np.abs(evidence.off(theta)).max() for evidence in (second, other))
         assert right < 1.0 * MBAR < 5.0 * MBAR < wrong
 
 
@@ -280,7 +280,9 @@ def quickly(samples: Samples, steps: int, monkeypatch: pytest.MonkeyPatch) -> tu
     """One round, from a guess that has the sensor where it is, and what was told of it."""
     monkeypatch.setattr(fitting, "NARROWING", (Round(1, 1.0, 1.5 * MBAR, steps, 1e-3),))
     monkeypatch.setattr(fitting, "AGAIN", ())
-    start = next(one for one in starts(first_guess(LONG_LINE), np.nan) if sensor_place(one) < 0.5)
+    start = next(
+        start for start in starts(first_guess(LONG_LINE), np.nan) if sensor_place(start) < 0.5
+    )
     told_of: list[str] = []
     return fit_from_afar(samples, [start], told_of.append), told_of[-1]
 

@@ -495,7 +495,7 @@ def test_two_stages_have_a_kink_where_the_flap_closes():
     rig = draw_rig(4, "two_stage")
     ambient = rig.surroundings.ambient_pressure
     vacuum = np.linspace(0.0, rig.end_vacuum, 40)
-    flow = np.array([sucked_at(rig, ambient - one, 0.0) for one in vacuum])
+    flow = np.array([sucked_at(rig, ambient - depth, 0.0) for depth in vacuum])
     slope = -np.diff(flow)
     assert (slope > 0.0).all()
     assert slope[:5].mean() > 3.0 * slope[-10:].mean()

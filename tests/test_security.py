@@ -11,10 +11,10 @@ ROW = re.compile(r"^\| (?P<promise>[^|]+) \| `(?P<file>tests/\w+\.py)::(?P<test>
 def test_every_promise_has_its_test() -> None:
     text = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
     heads = "| promise | test |", "| --- | --- |"
-    table = [one for one in text.splitlines() if one.startswith("|") and one not in heads]
+    table = [line for line in text.splitlines() if line.startswith("|") and line not in heads]
     rows = list(ROW.finditer(text))
     assert len({row["test"] for row in rows}) == len(rows)
     assert [row[0] for row in rows] == table
     for row in rows:
         tree = ast.parse((ROOT / row["file"]).read_text(encoding="utf-8"))
-        assert row["test"] in {one.name for one in tree.body if isinstance(one, ast.FunctionDef)}
+        assert row["test"] in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}

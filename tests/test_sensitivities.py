@@ -24,7 +24,9 @@ from twin.signals import MBAR, MS, Phase
 
 Floats = npt.NDArray[np.float64]
 ROWS = np.repeat(np.array([Phase.IDLE, Phase.SUCTION, Phase.BLOW_OFF], np.uint8), (50, 400, 250))
-TYPICAL = [(one.name, {p.name: p.typical}) for one in EFFECTS.values() for p in one.parameters]
+TYPICAL = [
+    (effect.name, {p.name: p.typical}) for effect in EFFECTS.values() for p in effect.parameters
+]
 
 
 def expected(theta: Floats) -> Floats:

@@ -187,7 +187,7 @@ def test_a_shipped_configuration_is_one_page_that_a_person_writes(path: Path) ->
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 60
     numbers = re.findall(r"(?<![\w.])-?\d[\d.]*", re.sub(r'#.*|"[^"]*"', "", text))
-    fine = [one for one in numbers if len(one.strip("-0.").replace(".", "")) > 3]
+    fine = [number for number in numbers if len(number.strip("-0.").replace(".", "")) > 3]
     assert set(fine) <= {"1013", "1500", "4840", "5020", "5021"}  # no fitted digits
 
 

@@ -37,7 +37,7 @@ def table() -> pa.Table:
         [AT, 7, -1, 0, 1, 2, 3],
     ]
     return pa.table(
-        [pa.array(one, field.type) for one, field in zip(columns, fields, strict=True)],
+        [pa.array(column, field.type) for column, field in zip(columns, fields, strict=True)],
         pa.schema(fields),
     )
 
@@ -50,7 +50,7 @@ def cells(path: Path) -> Any:
 def test_a_sheet_holds_times_as_times_and_numbers_as_numbers(tmp_path: Path) -> None:
     export(table(), tmp_path / "a.xlsx")
     page = cells(tmp_path / "a.xlsx")
-    heads = [one.value for one in page[1]]
+    heads = [cell.value for cell in page[1]]
     assert heads == ["words", "time (UTC)", "leakage (mbar/s)", "plc_time_ns"]
     assert page.freeze_panes == "A2"
     first = page[2]
@@ -66,15 +66,15 @@ def test_a_sheet_holds_times_as_times_and_numbers_as_numbers(tmp_path: Path) -> 
 def test_text_never_becomes_a_formula_in_a_sheet(tmp_path: Path) -> None:
     export(table(), tmp_path / "a.xlsx")
     words = [row[0] for row in cells(tmp_path / "a.xlsx").iter_rows(min_row=2)]
-    assert [one.value for one in words] == BAD
-    assert {one.data_type for one in words[:-1]} == {"s"}
+    assert [cell.value for cell in words] == BAD
+    assert {cell.data_type for cell in words[:-1]} == {"s"}
 
 
 def test_text_never_becomes_a_formula_in_csv(tmp_path: Path) -> None:
     export(table(), tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    words = [one["words"] for one in rows]
+    words = [row["words"] for row in rows]
     assert words == ["'=1+1", "'+1", "'-1", "'@SUM(A1)", "'\t=1", "plain", ""]
     assert rows[0]["leakage"] == "-1.5"  # a number is none
 
@@ -104,8 +104,8 @@ def test_the_history_of_alarms(tmp_path: Path) -> None:
         Episode(LEAK, AT, AT + 2 * NS, AT + 3 * NS, "ann", told, LEAK),
     ]
     made = history_table(episodes, {}, UNIT)
-    assert [one.value for one in made.column("raised")] == [AT, AT]
-    assert [one.value for one in made.column("cleared")] == [None, AT + 2 * NS]
+    assert [cell.value for cell in made.column("raised")] == [AT, AT]
+    assert [cell.value for cell in made.column("cleared")] == [None, AT + 2 * NS]
     gone, one = made.drop_columns(["raised", "cleared", "acknowledged"]).to_pylist()
     assert (gone["alarm"], gone["active"], gone["priority"]) == ("gone", None, None)
     assert (one["active"], one["acknowledged_by"], one["evidence"]) == (2.0, "ann", "leaks")
@@ -116,7 +116,9 @@ def test_alarms_are_exported_from_their_database(run: Any, tmp_path: Path) -> No
     begun(tmp_path / "alarms.sqlite").close()
     assert run("export", "-o", "h.xlsx") == "1 alarms in h.xlsx\n"
     page = cells(tmp_path / "h.xlsx")
-    values = dict(zip([one.value for one in page[1]], [one.value for one in page[2]], strict=True))
+    values = dict(
+        zip([cell.value for cell in page[1]], [cell.value for cell in page[2]], strict=True)
+    )
     assert (values["alarm"], values["priority"]) == (LEAK, "medium")
     assert values["raised (UTC)"] == datetime(2001, 9, 9, 1, 46, 45)
     assert values["cleared (UTC)"] is None

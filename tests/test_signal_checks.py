@@ -64,7 +64,10 @@ def cycles(name: str, samples: Samples) -> Sequence[Cycle]:
 def told(name: str, samples: Samples) -> dict[str, str]:
     """What each signal that contradicts says."""
     knees, theta = rigs.knees(name), rigs.theta(name)
-    return {one.signal: one.what for one in standing(cycles(name, samples), theta, knees)}
+    return {
+        contradiction.signal: contradiction.what
+        for contradiction in standing(cycles(name, samples), theta, knees)
+    }
 
 
 @pytest.mark.parametrize(("name", "tags"), [("test_rig", TAGS), ("gripper", OPENED)])
@@ -157,10 +160,10 @@ def test_another_h2_than_configured_is_told_with_its_value(name: str) -> None:
 def test_one_cycle_alone_raises_nothing_and_agreement_is_told_too() -> None:
     samples = simulated("gripper").copy()
     parts = list(whole(rigs.twin("gripper").over([samples])))
-    wrong = [replace(one, samples=changed(one.samples, barometer)) for one in parts]
+    wrong = [replace(piece, samples=changed(piece.samples, barometer)) for piece in parts]
     watch = ReportWatch(rigs.theta("gripper"), rigs.knees("gripper"))
     stream = [parts[0], wrong[1], parts[2], wrong[3], wrong[4], wrong[5], *parts[6:9]]
-    events = [[event.kind for event in watch.take(one)] for one in stream]
+    events = [[event.kind for event in watch.take(cycle)] for cycle in stream]
     against, agrees = Kind.SIGNAL_CONTRADICTS, Kind.SIGNAL_AGREES
     assert events == [[], [], [], [], [against], [], [], [agrees], []]
 
@@ -219,7 +222,7 @@ def test_a_commissioning_goes_by_the_pressure_where_the_report_is_wrong() -> Non
     config = typed("gripper")
     samples = changed(simulated("gripper", h2_mbar=450.0), never_saves)
     found = commission(config, [samples], quiet)
-    assert [one.signal for one in found.contradictions] == ["nozzle"]
+    assert [contradiction.signal for contradiction in found.contradictions] == ["nozzle"]
     assert found.readings.saves_air
     words = commissioned_in_words(found)
     assert found.contradictions[0].what in words

@@ -375,7 +375,7 @@ class Echo:
     def follow(self, samples: Samples, events: Sequence[Event]) -> list[Event]:
         times = samples["time_ns"]
         assert (np.diff(times) > 0).all()  # one time at once: it may look rows up by it
-        return [Event(one.time_ns, Kind.ALARM, str(one.kind)) for one in events]
+        return [Event(event.time_ns, Kind.ALARM, str(event.kind)) for event in events]
 
     def finish(self) -> list[Event]:
         return []
@@ -419,4 +419,4 @@ def test_what_a_restart_cuts_is_told_in_its_own_time(size: int, back_s: float) -
     assert told[first_after].time_ns == samples["time_ns"][begin]
     answered = [event for event in told if event.kind is Kind.ALARM]
     assert len(answered) == len(told) / 2
-    assert all(told.index(one) > kinds_told.index(Kind(one.text)) for one in answered)
+    assert all(told.index(event) > kinds_told.index(Kind(event.text)) for event in answered)

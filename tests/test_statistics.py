@@ -26,12 +26,12 @@ def heard() -> list[Heard]:
     theta = rigs.theta("gripper")
     bank = ModelBank(theta)
     found = [(cycle, *bank.take(cycle), figures(cycle, theta)) for cycle in cut([rows])]
-    return [one for one in found if one[0].complete and one[0].settled]
+    return [heard for heard in found if heard[0].complete and heard[0].settled]
 
 
-def without(one: Heard, rows: slice) -> Heard:
+def without(heard: Heard, rows: slice) -> Heard:
     """The same cycle with no deviation in some rows."""
-    cycle, drawn, expected, found = one
+    cycle, drawn, expected, found = heard
     ticks = cycle.ticks.copy()
     ticks["expected"][rows] = np.nan
     return Cycle(0, cycle.samples, ticks, complete=True), drawn, expected, found
@@ -50,19 +50,19 @@ def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]
     np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
 
 
-def assert_same(one: CycleResidual | None, other: CycleResidual | None) -> None:
-    assert one
+def assert_same(residual: CycleResidual | None, other: CycleResidual | None) -> None:
+    assert residual
     assert other
     for name in (field.name for field in fields(CycleResidual)):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(residual, name), getattr(other, name), err_msg=name)
 
 
 def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[Heard]) -> None:
     """Else its scores are what steps make of nothing, and false alarms are three times as many."""
-    names = [one.parameter.name for one in SUSPECTS]
-    for one in heard:
-        assert "h1_low_level" not in one[3]  # the nozzle stays off
-        said = listener().hear(*one)
+    names = [suspect.parameter.name for suspect in SUSPECTS]
+    for cycle in heard:
+        assert "h1_low_level" not in cycle[3]  # the nozzle stays off
+        said = listener().hear(*cycle)
         assert said
         shown = np.isfinite(said.scores())
         assert [names[i] for i in np.flatnonzero(~shown)] == ["h2_shift"]
@@ -70,8 +70,8 @@ def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[Heard]) 
 
 def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[Heard]) -> None:
     old = listener()
-    for one in heard * 2:
-        for other in (one, without(one, slice(300, 350)), without(one, slice(0, 3))):
+    for cycle in heard * 2:
+        for other in (cycle, without(cycle, slice(300, 350)), without(cycle, slice(0, 3))):
             assert_same(old.hear(*other), listener().hear(*other))
 
 

@@ -167,7 +167,7 @@ def test_an_alarm_stands_while_any_output_is_down() -> None:
     outages.end("log", 5.0)
     outages.end("console", 6.0)
     told = notices.taken(0)
-    assert [values(one) for one in told] == [{"output_down": up} for up in (1.0, 1.0, 1.0, 0.0)]
+    assert [values(event) for event in told] == [{"output_down": up} for up in (1.0, 1.0, 1.0, 0.0)]
     assert evidence(told[0]) == {"output_down": {"words": told[0].text}}
 
 
@@ -213,8 +213,8 @@ class Advised:
 
     def told(self) -> list[tuple[Kind, int, int]]:
         return [
-            (one.kind, one.data.get("rows_lost", 0), one.data.get("events_lost", 0))
-            for one in self.notices.taken(0)
+            (event.kind, event.data.get("rows_lost", 0), event.data.get("events_lost", 0))
+            for event in self.notices.taken(0)
         ]
 
 
@@ -321,7 +321,7 @@ def test_the_end_of_an_alarm_is_heard_though_its_adviser_was_down() -> None:
 
     def said(kind: Kind, at_ns: int, rows: Samples) -> list[str]:
         events = [Event(at_ns, kind, "", {"effect": "leakage"})]
-        return [one.data["deed"] for one in supervised.follow(rows, events)]
+        return [event.data["deed"] for event in supervised.follow(rows, events)]
 
     assert said(Kind.DEVIATION, int(samples["time_ns"][0]), samples[:10]) == ["raised"]
     alarms.broken = True
@@ -387,7 +387,7 @@ def test_a_disk_that_is_full_for_a_while_costs_no_row(
         disk.full = begin < now < begin + 6.0
 
     samples, ticks, told = logged(tmp_path / "a.mcap", at)
-    assert [one.kind for one in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
+    assert [event.kind for event in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
     log = open_log(tmp_path / "a.mcap")
     assert len(log.parts) > 1
     assert rows_of(log) == (samples.tobytes(), ticks.tobytes())
@@ -428,7 +428,7 @@ def test_a_folder_that_somebody_deletes_is_made_again(tmp_path: Path) -> None:
             path.parent.rmdir()
 
     samples, _, told = logged(path, at)
-    assert [one.kind for one in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
+    assert [event.kind for event in told] == [Kind.OUTPUT_DOWN, Kind.OUTPUT_BACK]
     assert "deleted" in told[0].text
     parts = sorted(path.parent.iterdir())
     after = np.concatenate([rows for rows, _ in open_log(parts[0]).blocks()])

@@ -71,7 +71,7 @@ def test_it_is_followed_the_same_however_the_stream_is_cut(size: int) -> None:
     samples = another_day("gripper")[:9000].copy()
     samples["ambient"] += np.arange(9000, dtype=np.float32) * 0.2  # Pa, it clears up
     ticks = [
-        rigs.expectation(rigs.twin("gripper"), rigs.cut(samples, one))[1] for one in (500, size)
+        rigs.expectation(rigs.twin("gripper"), rigs.cut(samples, rows))[1] for rows in (500, size)
     ]
     assert ticks[0].tobytes() == ticks[1].tobytes()
 
@@ -97,7 +97,7 @@ def test_a_diagnosis_goes_by_the_day_of_its_log(name: str) -> None:
     assert evidence.theta[c.AMBIENT] == pytest.approx(990 * MBAR, abs=20.0)
     assert evidence.theta[c.TEMPERATURE] == pytest.approx(308.15, abs=0.1)
     beside = collect(rigs.config(name), [blind(another_day(name))])
-    followed, unseen = (np.sqrt(np.nanmean(one.off([()]) ** 2)) for one in (evidence, beside))
+    followed, unseen = (np.sqrt(np.nanmean(log.off([()]) ** 2)) for log in (evidence, beside))
     assert followed < 0.5 * unseen
 
 
@@ -130,4 +130,4 @@ def test_a_barometer_that_contradicts_is_not_gone_by() -> None:
     guess, remarks = guessed(typed("gripper").data, read(samples))
     assert guess.ambient.pressure_mbar == pytest.approx(990.0, abs=1.0)
     assert "sensor_offset" not in guess.effects
-    assert [one.line.split(" =")[0] for one in remarks] == ["[data.ambient] pressure_mbar"]
+    assert [remark.line.split(" =")[0] for remark in remarks] == ["[data.ambient] pressure_mbar"]

@@ -79,7 +79,11 @@ def found_where_true(samples: Samples, truth: npt.NDArray[np.void], knees: Knees
     late = []
     found = switches(phase == Phase.SUCTION, suction)
     for row, on in sorted(true):
-        near = [one for one in found if one[1] == on and abs(one[0] - row) <= NEAR]
+        near = [
+            switching
+            for switching in found
+            if switching[1] == on and abs(switching[0] - row) <= NEAR
+        ]
         if not near and to_end[row] <= knees.lag + NEAR:
             continue
         assert len(near) == 1, f"the nozzle switched to {on} at row {row}, found: {sorted(found)}"
@@ -357,7 +361,7 @@ def found_late(name: str, factor: float) -> tuple[float, float]:
     suction = samples["commands"] == Command.SUCTION
     true, found = (switches(on, suction) for on in (truth["nozzle"] == 1, phase == Phase.SUCTION))
     off, on = (
-        [min((row - one for one, as_well in true if as_well == to), key=abs) for row in rows]
+        [min((row - other for other, as_well in true if as_well == to), key=abs) for row in rows]
         for to in (False, True)
         for rows in ([row for row, what in found if what == to],)
     )

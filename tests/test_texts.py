@@ -30,7 +30,7 @@ def catalogue(code: str) -> Catalog:
 
 
 def test_every_text_is_german_too_and_none_is_stale(said: set[str | tuple[str, str]]) -> None:
-    german = {one.id: is_translated(one) for one in catalogue("de") if one.id}
+    german = {message.id: is_translated(message) for message in catalogue("de") if message.id}
     assert {text for text in said if not german.get(text)} == set()  # python tools/texts.py
     assert set(german) - said == set()
     assert len(said) > 600
@@ -45,16 +45,17 @@ def test_no_text_hides_inside_another_string() -> None:
 
 @pytest.mark.parametrize("path", sorted(LOCALE.glob("*.po")), ids=lambda path: path.stem)
 def test_what_is_filled_in_has_a_place_in_each_translation(path: Path) -> None:
-    for one in catalogue(path.stem):
-        if one.id and is_translated(one):
-            several = isinstance(one.id, tuple)
-            for form in one.string if several else [one.string]:
-                english = one.id[-1] if several else one.id  # a form for one may say it in words
+    for message in catalogue(path.stem):
+        if message.id and is_translated(message):
+            several = isinstance(message.id, tuple)
+            for form in message.string if several else [message.string]:
+                # A form for one may say it in words.
+                english = message.id[-1] if several else message.id
                 assert set(NAMES.findall(form)) ^ set(NAMES.findall(english)) <= {"count"} & (
                     {"count"} if several else set()
-                ), one.id
+                ), message.id
                 assert "$" not in form
-            assert not one.fuzzy
+            assert not message.fuzzy
 
 
 @pytest.mark.parametrize("path", sorted(STATIC.glob("*.html")), ids=lambda path: path.name)
@@ -63,8 +64,8 @@ def test_no_page_says_anything_that_is_not_marked(path: Path) -> None:
     text = re.sub(r"<(title|option|button)[^>]*>(\d+ (s|min)|\$\w+)</\1>", "", text)
     between = re.findall(r">([^<>]+)<", text)
     attributes = re.findall(r'(?:aria-label|title|placeholder|alt)="([^"]*)"', text)
-    words = [one for one in (*between, *attributes) if re.search(r"[A-Za-z]", one)]
-    assert [one for one in words if not one.strip().startswith("$")] == []
+    words = [text for text in (*between, *attributes) if re.search(r"[A-Za-z]", text)]
+    assert [word for word in words if not word.strip().startswith("$")] == []
 
 
 @pytest.mark.parametrize("path", sorted(STATIC.glob("*.js")), ids=lambda path: path.name)
@@ -74,9 +75,9 @@ def test_no_script_says_anything_that_is_not_marked(path: Path) -> None:
     script = re.sub(r'\bt\(\s*"[^"]+"|\btn\(\s*"[^"]+",\s*"[^"]+"', "", script)
     quoted = re.findall(r'"([^"\n]*)"', script)
     assert [
-        one
-        for one in quoted
-        if re.match(r"[A-Z][a-z]+( |$)|[a-z]+ [a-z]+", one) and one not in CODE
+        text
+        for text in quoted
+        if re.match(r"[A-Z][a-z]+( |$)|[a-z]+ [a-z]+", text) and text not in CODE
     ] == []
 
 
@@ -103,7 +104,7 @@ def test_what_a_browser_accepts_is_chosen(chosen: str, accepted: str, code: str)
 
 
 def test_languages_call_themselves_by_their_own_names() -> None:
-    names = {one["code"]: one["name"] for one in Catalogues().names}
+    names = {language["code"]: language["name"] for language in Catalogues().names}
     assert names["en"] == "English"
     assert names["de"] == "Deutsch"
 

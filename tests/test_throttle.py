@@ -69,7 +69,7 @@ def test_tries_at_one_time_are_not_taken_by_each_of_several_processes(path: Path
         subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=rigs.ROOT)
         for _ in range(3)
     ]
-    taken = [int(one.communicate("\n", timeout=60)[0]) for one in running]
+    taken = [int(process.communicate("\n", timeout=60)[0]) for process in running]
     assert sum(taken) <= FREE_TRIES + 1  # and one where a second passed
 
 

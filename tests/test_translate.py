@@ -108,15 +108,15 @@ def loaded(text: str, folder: Path) -> ctypes.CDLL:
 @pytest.fixture(scope="module", params=[pytest.param("cc", marks=pytest.mark.needs("cc"))])
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     program = Program()
-    for one in FUNCTIONS:
-        program.function(one, NUMBER, NUMBER)
+    for function in FUNCTIONS:
+        program.function(function, NUMBER, NUMBER)
     program.function(rows, ROWS, ROWS, INDEX)
     program.function(lanes, ROWS, LANE)
     text = program.text().replace("static double test_", "double test_")
     return loaded(text.replace("static void test_", "void test_"), tmp_path_factory.mktemp("c"))
 
 
-@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
 def test_both_give_the_same_to_the_last_bit(
     function: Callable[..., float], library: ctypes.CDLL
 ) -> None:

@@ -169,12 +169,12 @@ def test_a_log_that_is_asked_for_arrives_whole(
         heard.until("/status", status="online")
         ask(running.port, "a-1", log="today.mcap")
         answers = [heard.until("/upload", request="a-1") for _ in range(3)]
-    assert [one["state"] for one in answers] == ["accepted", "running", "done"]
-    assert answers[-1]["files"] == [described(one) for one in parts]
+    assert [answer["state"] for answer in answers] == ["accepted", "running", "done"]
+    assert answers[-1]["files"] == [described(path) for path in parts]
     assert answers[-1]["asset"] == {"type": TYPE, "id": ID, "batch": "B7"}
     assert answers[-1]["unfinished"] == []
-    assert store.kept == {f"/logs/{TYPE}/{ID}/{one.name}": one.read_bytes() for one in parts}
-    assert {one["Authorization"] for one in store.heads} == {"Bearer s3cret"}
+    assert store.kept == {f"/logs/{TYPE}/{ID}/{path.name}": path.read_bytes() for path in parts}
+    assert {head["Authorization"] for head in store.heads} == {"Bearer s3cret"}
     sent = hashlib.sha256(parts[0].read_bytes()).digest()
     assert store.heads[0]["Content-Digest"] == f"sha-256=:{base64.b64encode(sent).decode()}:"
 
@@ -191,7 +191,7 @@ def test_a_range_of_time_finds_the_parts_that_were_received_then(
         heard.until("/status", status="online")
         ask(running.port, "r", **{"from": begin.isoformat(), "to": end.isoformat()})
         done = heard.until("/upload", state="done")
-    assert [one["name"] for one in done["files"]] == ["a.0001.mcap"]
+    assert [file["name"] for file in done["files"]] == ["a.0001.mcap"]
     (copy,) = (tmp_path / "share").rglob("*.*cap*")
     assert copy.read_bytes() == (tmp_path / "logs" / "a.0001.mcap").read_bytes()
 
@@ -212,7 +212,7 @@ def test_what_is_still_written_is_not_uploaded(tmp_path: Path, running: Broker) 
         ask(running.port, "2", log="live.mcap")
         done = heard.until("/upload", state="done")
     assert none["why"] == "no finished file of a log is like that; not finished: live.mcap"
-    assert [one["name"] for one in done["files"]] == ["live.mcap"]
+    assert [file["name"] for file in done["files"]] == ["live.mcap"]
     assert done["unfinished"] == ["live.0001.mcap"]
 
 
@@ -250,7 +250,7 @@ def test_a_link_among_the_parts_is_left_out(tmp_path: Path, running: Broker) -> 
         heard.until("/status", status="online")
         ask(running.port, "1", log=first.name)
         done = heard.until("/upload", state="done")
-    assert [one["name"] for one in done["files"]] == [first.name]
+    assert [file["name"] for file in done["files"]] == [first.name]
 
 
 @pytest.mark.parametrize(
@@ -296,12 +296,12 @@ def test_it_goes_on_where_it_was_after_a_restart(
             wait_until(lambda: len(store.heads) == 3)  # the second part again, which hangs
             first.outlets._uploader.end()  # type: ignore[union-attr]
             store.holds.set()
-        assert any("status 503" in one for one in first.said)
+        assert any("status 503" in line for line in first.said)
         assert list(store.kept) == [f"/logs/{TYPE}/{ID}/today.mcap"]
         with Edge(tmp_path, running.port, url=store.url):
             done = heard.until("/upload", state="done")
         assert len(store.heads) == 3 + 2, "what has arrived is not sent again"
-    assert done["files"] == [described(one) for one in parts]
+    assert done["files"] == [described(path) for path in parts]
 
 
 def test_a_request_finds_an_edge_that_was_away(tmp_path: Path, running: Broker) -> None:
@@ -373,7 +373,7 @@ def test_nothing_in_a_folder_is_replaced_and_a_share_is_waited_for(
         assert not share.exists()
         share.mkdir()
         heard.until("/upload", request="1", state="done")
-        (copy,) = (one for one in share.rglob("*") if one.is_file())
+        (copy,) = (path for path in share.rglob("*") if path.is_file())
         assert copy.read_bytes() == log.read_bytes()
         ask(running.port, "2", log="today.mcap")
         heard.until("/upload", request="2", state="done")

@@ -101,9 +101,9 @@ def test_a_name_that_is_none_takes_as_long(
 
 def test_a_role_may_what_those_before_it_may() -> None:
     look, acknowledge, configure = Role
-    assert [acknowledge.covers(one) for one in Role] == [True, True, False]
-    assert [configure.covers(one) for one in Role] == [True, True, True]
-    assert [look.covers(one) for one in Role] == [True, False, False]
+    assert [acknowledge.covers(role) for role in Role] == [True, True, False]
+    assert [configure.covers(role) for role in Role] == [True, True, True]
+    assert [look.covers(role) for role in Role] == [True, False, False]
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "x" * 41, 'a"', "a\n"])

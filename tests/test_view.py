@@ -183,8 +183,13 @@ def test_alarms_stand_beside_events(target: Path) -> None:
 def test_probabilities_of_what_is_no_longer_likely_come_to_0(target: Path) -> None:
     said = ({"none": 1.0}, {"none": 0.1, "leakage": 0.9}, None, {"none": 0.3, "sensor_lag": 0.7})
     events = tuple(
-        Event(START_NS + at * MS_NS, Kind.CYCLE, "", {} if one is None else {"probabilities": one})
-        for at, one in enumerate(said)
+        Event(
+            START_NS + at * MS_NS,
+            Kind.CYCLE,
+            "",
+            {} if probabilities is None else {"probabilities": probabilities},
+        )
+        for at, probabilities in enumerate(said)
     )
     record(target, block(10), events=events)
     assert scalars(target, "/probabilities/none") == {0: 1.0, 1: 0.1, 3: 0.3}
@@ -268,7 +273,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Screen, psutil.Proce
         monkeypatch.delenv(name, raising=False)
     before = psutil.Process().children()
     screen = Screen("gripper 7", None)
-    (viewer,) = (one for one in psutil.Process().children() if one not in before)
+    (viewer,) = (process for process in psutil.Process().children() if process not in before)
     yield screen, viewer
     screen.close()
 

@@ -275,7 +275,7 @@ def test_what_follows_the_address_is_not_told(tmp_path: Path, server: Server) ->
     server.close()
     told.append(str(hook.send([message(1)]).lost))
     hook.close()
-    assert [one for one in told if "s3cret" in one] == []
+    assert [line for line in told if "s3cret" in line] == []
 
 
 @pytest.mark.parametrize(

@@ -70,9 +70,9 @@ class Garbler:
             except OSError:
                 return
             plc = socket.create_connection(("127.0.0.1", self._to))
-            for one in (client, plc):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._open.add(one)
+            for end in (client, plc):
+                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._open.add(end)
             done = threading.Barrier(2, action=lambda a=client, b=plc: (a.close(), b.close()))
             for work in (self._ask, self._answer):
                 thread = threading.Thread(target=self._carry, args=(work, client, plc, done))
@@ -82,9 +82,9 @@ class Garbler:
     def _carry(self, work: Any, client: socket.socket, plc: socket.socket, done: Any) -> None:
         with suppress(OSError):
             work(client, plc)
-        for one in (client, plc):
-            _hang_up(one)
-            self._open.discard(one)
+        for end in (client, plc):
+            _hang_up(end)
+            self._open.discard(end)
         done.wait(10)
 
     def _ask(self, client: socket.socket, plc: socket.socket) -> None:

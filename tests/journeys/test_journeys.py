@@ -218,7 +218,7 @@ def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
     begin = datetime(2026, 3, 1, 12, 0, 0)
     for number, row in enumerate(rows):
         bits = int(row["commands"])
-        commands = [bool(bits & one) for one in (Command.SUCTION, Command.BLOW_OFF)]
+        commands = [bool(bits & command) for command in (Command.SUCTION, Command.BLOW_OFF)]
         vacuum = (101_300.0 - float(row["pressure"])) / 1e3
         sheet.append([begin + timedelta(milliseconds=10 * number), round(vacuum, 3), *commands])
     book.save(tmp_path / "Messung.xlsx")

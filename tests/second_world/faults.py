@@ -114,12 +114,12 @@ def schedule(
     for number, fault in enumerate(faults):
         drawn = np.random.default_rng([seed, 77, number]).random(len(starts_ms)) < fault.share
         chosen = list(np.flatnonzero(drawn)) if fault.cycles is None else list(fault.cycles)
-        shares = _shares(fault, times, starts_ms, [int(one) for one in chosen])
+        shares = _shares(fault, times, starts_ms, [int(cycle) for cycle in chosen])
         for name, size in fault.parameters.items():
             unit = EVERYTHING[fault.effect][name]
             sizes[:, INDEX[fault.effect, name]] += size * unit * shares
         if fault.course == "intermittent":
-            affected[fault.effect] = [int(one) for one in chosen]
+            affected[fault.effect] = [int(cycle) for cycle in chosen]
     _to_plant(rig, sizes)
     return Schedule(times, sizes, affected)
 
