@@ -32,7 +32,6 @@ from twin.errors import ConfigError, SourceError
 # The library logs each error with its traceback; what matters is raised as well.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL + 1)
 
-NAMESPACES = Node("i=2255", "http://opcfoundation.org/UA/")
 POLICIES = {
     "Basic256Sha256": security_policies.SecurityPolicyBasic256Sha256,
     "Aes256Sha256RsaPss": security_policies.SecurityPolicyAes256Sha256RsaPss,

@@ -27,7 +27,7 @@ from twin.alarms.loop import Before, News
 from twin.alarms.requests import LimitChange, Request
 from twin.alarms.state import Deed, Kept
 from twin.assets.engine import Database, Purpose
-from twin.assets.unit import Unit, of_unit
+from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.errors import ConfigError
 from twin.files import json_text
 
@@ -35,16 +35,10 @@ ALARM_DATABASE = Purpose("alarm database", "--alarms", "alarms")
 
 metadata = MetaData()
 
-
-def unit_columns() -> tuple[Column[Any], Column[Any]]:
-    """Columns that say whose rows they are (``twin.assets.unit.of_unit``)."""
-    return Column("asset_type", Text, primary_key=True), Column("asset_id", Text, primary_key=True)
-
-
 STATE = Table(
     "alarm_state",
     metadata,
-    *unit_columns(),
+    *unit_columns(in_key=True),
     Column("alarm", Text, primary_key=True),
     Column("active", Boolean, nullable=False),
     Column("acknowledged", Boolean, nullable=False),
@@ -56,7 +50,7 @@ STATE = Table(
 EPISODE = Table(
     "alarm_episode",
     metadata,
-    *unit_columns(),
+    *unit_columns(in_key=True),
     Column("raised_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("raised_as", Text, primary_key=True),  # its name then
     Column("alarm", Text, nullable=False),
@@ -70,8 +64,7 @@ REQUEST = Table(
     "alarm_request",
     metadata,
     Column("id", Integer, primary_key=True),
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("alarm", Text, nullable=False),
     Column("deed", Text, nullable=False),
     Column("who", Text, nullable=False),
@@ -86,8 +79,7 @@ COMMENT = Table(
     "alarm_comment",
     metadata,
     Column("id", Integer, primary_key=True),
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("raised_ns", BigInteger, nullable=False),  # identifies the episode, with raised_as
     Column("raised_as", Text, nullable=False),
     Column("written_ns", BigInteger, nullable=False),
@@ -99,8 +91,7 @@ LIMIT = Table(  # changes of limits, by people
     "alarm_limit",
     metadata,
     Column("id", Integer, primary_key=True),
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("limit_key", Text, nullable=False),
     Column("value", Double),  # none: back to the configured value
     Column("who", Text, nullable=False),
@@ -114,7 +105,7 @@ LIMIT = Table(  # changes of limits, by people
 )
 
 # All units of which a run has kept alarms. They can be queried even if no alarm was ever raised.
-UNIT = Table("alarm_unit", metadata, *unit_columns())
+UNIT = Table("alarm_unit", metadata, *unit_columns(in_key=True))
 
 
 def open_store(

@@ -13,7 +13,6 @@ from twin.exchange.sources import main_source, sources
 from twin.exchange.variables import Component
 
 BEGINNING = (1980, 1, 1, 0, 0, 0)  # fixed time of every file inside: same content, same FMU
-VERSIONS = (3, 2)
 
 
 @dataclass(frozen=True)

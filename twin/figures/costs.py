@@ -16,7 +16,6 @@ from twin.signals import NS
 
 HOUR_S = 3600.0
 NL_PER_M3 = 1e3
-WH_PER_KWH = 1e3
 DAY_NS = 86_400 * SECOND_NS
 NO_PRICE = "no price is configured: set price_per_kwh or price_per_m3 under [figures]"
 

@@ -33,7 +33,7 @@ from sqlalchemy import (
 )
 
 from twin.assets.engine import Database, Purpose
-from twin.assets.unit import Unit, of_unit
+from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.figures.key_figures import FIGURES
 
 FIGURE_DATABASE = Purpose("figure database", "--figures", "figures")
@@ -46,8 +46,7 @@ metadata = MetaData()
 CYCLE = Table(
     "figure_cycle",
     metadata,
-    Column("asset_type", Text, primary_key=True),
-    Column("asset_id", Text, primary_key=True),
+    *unit_columns(in_key=True),
     Column("host_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("begin_ns", BigInteger, primary_key=True, autoincrement=False),
     Column("data_set", Text, primary_key=True),  # content hash of the twin's data
@@ -64,8 +63,7 @@ CYCLE = Table(
 ERASED = Table(
     "figure_erased",
     metadata,
-    Column("asset_type", Text, primary_key=True),
-    Column("asset_id", Text, primary_key=True),
+    *unit_columns(in_key=True),
     Column("host_ns", BigInteger, primary_key=True, autoincrement=False),
 )
 

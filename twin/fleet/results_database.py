@@ -26,6 +26,7 @@ from sqlalchemy import (
 )
 
 from twin.assets.engine import ASSETS, Database
+from twin.assets.unit import unit_columns
 from twin.config import Config
 from twin.fleet.tasks import code
 from twin.log.reader import Log
@@ -41,8 +42,7 @@ RESULT = Table(
     Column("log_sha256", Text, primary_key=True),
     Column("code", Text, primary_key=True),
     Column("basis", Text, primary_key=True),
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("batch", Text, nullable=False),
     Column("log", Text, nullable=False),  # its path then
     Column("begin_ns", BigInteger, nullable=False),  # when it was recorded, UTC

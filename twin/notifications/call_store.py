@@ -8,9 +8,9 @@ from typing import Any
 
 from sqlalchemy import URL, Column, MetaData, Table, Text, select
 
-from twin.alarms.database import EPISODE, unit_columns
+from twin.alarms.database import EPISODE
 from twin.alarms.database import metadata as alarm_metadata
-from twin.assets.unit import Unit, of_unit
+from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.notifications.escalation import Call, Outcome
 from twin.notifications.outbox import Outbox
 
@@ -19,7 +19,7 @@ metadata = MetaData()
 CALL = Table(
     "alarm_call",
     metadata,
-    *unit_columns(),
+    *unit_columns(in_key=True),
     Column("alarm", Text, primary_key=True),
     Column("call", Text, nullable=False),  # JSON
 )

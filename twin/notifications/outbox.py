@@ -30,7 +30,7 @@ from sqlalchemy import (
 
 from twin.alarms.database import ALARM_DATABASE
 from twin.assets.engine import Database
-from twin.assets.unit import Unit, of_unit
+from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.notifications.message import Message
 
 metadata = MetaData()
@@ -40,8 +40,7 @@ OUTBOX = Table(
     metadata,
     Column("number", Integer, primary_key=True),  # the order
     Column("destination", Text, nullable=False),
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("id", Text, nullable=False),
     Column("alarm", Text, nullable=False),
     Column("body", Text, nullable=False),  # JSON

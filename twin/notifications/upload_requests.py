@@ -23,7 +23,7 @@ from sqlalchemy import (
 
 from twin.alarms.database import ALARM_DATABASE
 from twin.assets.engine import Database
-from twin.assets.unit import Unit, of_unit
+from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.errors import TwinError
 from twin.settings import Settings
 
@@ -98,8 +98,7 @@ UPLOADS = Table(
     "uploads",
     metadata,
     Column("number", Integer, primary_key=True),  # the order
-    Column("asset_type", Text, nullable=False),
-    Column("asset_id", Text, nullable=False),
+    *unit_columns(in_key=False),
     Column("id", Text, nullable=False),
     Column("request", Text, nullable=False),  # JSON
     Column("asked_ns", BigInteger, nullable=False),
