@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.model import theta as c
-from twin.monitor.cycles import FEWEST_ROWS, LONGEST_PIECE, Cycle, CycleCutter, figures, whole
+from twin.monitor.cycles import (
+    BATCH,
+    FEWEST_ROWS,
+    LONGEST_PIECE,
+    Cycle,
+    CycleCutter,
+    figures,
+    whole,
+)
 from twin.quality import BREAK, Quality
 from twin.signals import MBAR, SAMPLE, TICK, Phase, Samples, Ticks
 
@@ -91,6 +99,26 @@ def test_a_record_is_judged_in_whole_cycles_however_long_a_part_is_held() -> Non
     found = whole([rows((IDLE, 5), *held, *held, *held, (SUCTION, 9))])
     assert [(one.index, len(one.samples)) for one in found] == [(n, 31_060) for n in range(3)]
     assert [one.settled for one in found] == [False, True, True]
+
+
+def test_rows_of_an_unfinished_piece_are_given_when_a_batch_is_new() -> None:
+    samples, ticks = rows((IDLE, 5), (SUCTION, 3 * BATCH))
+    cutter, given_rows = CycleCutter(), []
+    for begin in range(0, len(samples), 100):
+        part = slice(begin, begin + 100)
+        list(cutter.push(samples[part], ticks[part]))
+        if begun := cutter.begun():
+            piece_samples, piece_ticks, at_edge = begun
+            assert at_edge
+            end = 5 + len(piece_samples)
+            assert piece_samples.tobytes() == samples[5:end].tobytes()
+            assert piece_ticks.tobytes() == ticks[5:end].tobytes()
+            given_rows.append(len(piece_samples))
+    assert given_rows == [295, 595]
+    (cycle,) = cutter.flush()
+    assert cycle.samples.tobytes() == samples[5:].tobytes()
+    list(cutter.push(*rows((IDLE, BATCH))))
+    assert cutter.begun() is not None  # the count begins anew with the next piece
 
 
 phases = st.lists(st.tuples(st.sampled_from(Phase), st.integers(1, 60)), min_size=1, max_size=25)

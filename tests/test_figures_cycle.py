@@ -50,7 +50,8 @@ def told(
     found = []
     for part in zip(np.split(samples, cuts), np.split(ticks, cuts), strict=True):
         found += [key.take(piece) for piece in cutter.push(*part)]
-        key.ahead(*cutter.begun)  # as the monitor does
+        if begun := cutter.begun():
+            key.run_ahead(*begun)  # as the monitor does
     found += [key.take(piece) for piece in cutter.flush()]
     return [one for one in found if one is not None]
 

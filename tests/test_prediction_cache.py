@@ -278,7 +278,8 @@ def test_what_is_used_again_does_not_depend_on_blocks(name: str, most: int) -> N
     found = []
     for block in blocks(samples, ticks, sizes):
         found += [bank.take(cycle) for cycle in cutter.push(*block)]
-        bank.ahead(*cutter.begun)
+        if begun := cutter.begun():
+            bank.run_ahead(*begun)
     found += [bank.take(cycle) for cycle in cutter.flush()]
     for one, other in zip(found, right, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
@@ -293,7 +294,7 @@ def test_while_a_cycle_may_go_as_a_known_one_nothing_is_stepped(
     cycle = later(longer(known, Phase.SUCTION, 300), known)
     stepped, suction = Stepped(monkeypatch), int(np.sum(known.ticks["phase"] == Phase.SUCTION))
     for end in range(50, len(cycle.samples), 50):
-        bank.ahead([(cycle.samples[:end], cycle.ticks[:end])], at_edge=True)
+        bank.run_ahead(cycle.samples[:end], cycle.ticks[:end], at_edge=True)
         if end <= suction + LONGER_MS:
             assert stepped.rows == 0
     before = stepped.rows
@@ -315,7 +316,7 @@ def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
     assert first in kept
     assert sorted(kept)[1:] == [first + 30 * (2 * KEPT - n) for n in reversed(range(KEPT - 1))]
     assert all(len(drawing.drawn) <= LONGEST_PIECE for drawing in bank._drawings._kept)
-    assert bank._seen == len(bank._expected) == 0
+    assert bank._stepped == len(bank._expected) == 0
 
 
 @pytest.mark.parametrize("broken", [Quality.GAP, Quality.BAD])

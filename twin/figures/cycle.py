@@ -1,7 +1,7 @@
 """From cycles to their key figures: measured and expected side by side, and the warnings."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,7 +26,6 @@ _LABELS = {
     "leakage": "leakage",
     "free_flow": "free-flow vacuum",
 }
-AHEAD = 250  # fewest rows for which the model runs early: each call has a fixed cost
 MOST_PIECES = 30  # of a long cycle, five minutes; a longer one is evaluated before its end
 
 
@@ -108,36 +107,33 @@ class KeyFigures:
     watch: MonitorSettings = field(default_factory=MonitorSettings)  # pyright: ignore[reportArgumentType]
     _pieces: list[Cycle] = field(default_factory=list)  # of a long cycle that is not over
     _index: int = -1  # of the cycle that was begun last
-    _rows_run: int = 0  # rows of the next piece that the model has run over
 
     def __post_init__(self) -> None:
         self._unit = Unit(self.data, self.settings.energy_kwh_m3)
         self.limits = limits(self.settings, self.data, self.watch)  # a person may change them
         self._expectation = Expectation(self.data)
 
-    def ahead(self, pieces: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+    def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
         """Run the model over the rows of the next piece that have arrived so far."""
-        rows = sum(len(samples) for samples, _ in pieces)
-        if rows - self._rows_run < AHEAD:
-            return
-        if at_edge or (self._pieces and not pieces[0][0]["quality"][0] & BREAK):
-            samples, ticks = (joined(*column) for column in zip(*pieces, strict=True))
+        if at_edge or self._goes_on(samples):
             self._run(samples, ticks)
+
+    def _goes_on(self, samples: Samples) -> bool:
+        """Whether a piece without a suction edge continues the collected ones."""
+        return bool(self._pieces) and not samples["quality"][0] & BREAK
 
     def _run(self, samples: Samples, ticks: Ticks) -> None:
         """Run the model over the rows of a piece that it has not run over yet."""
-        fresh, self._rows_run = slice(self._rows_run, None), len(samples)
-        self._expectation.go_on(samples[fresh], ticks[fresh], at_edge=not self._pieces)
+        done = self._expectation.rows - sum(len(piece.samples) for piece in self._pieces)
+        self._expectation.go_on(samples[done:], ticks[done:], at_edge=not self._pieces)
 
     def take(self, piece: Cycle) -> CycleFigures | None:
         """Take the next piece; give the key figures of the cycle if the piece completes it."""
         at_edge = piece.index > self._index
-        goes_on = bool(self._pieces) and not piece.samples["quality"][0] & BREAK
-        if not at_edge and not goes_on:
+        if not at_edge and not self._goes_on(piece.samples):
             return self._break_off(piece)
         self._index = piece.index
         self._run(piece.samples, piece.ticks)
-        self._rows_run = 0
         self._pieces.append(piece)
         over = int(piece.ticks["phase"][-1]) in _OVER
         if not over and len(piece.samples) == LONGEST_PIECE and len(self._pieces) < MOST_PIECES:

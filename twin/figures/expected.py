@@ -41,7 +41,7 @@ class Expectation:
     _control: kernel.Control = field(default_factory=kernel.Control.anew)
     _steps: TimeSteps = field(default_factory=TimeSteps)
     _edges: int = 0  # since it began
-    _rows: int = 0  # of the cycle so far
+    rows: int = 0  # of the cycle so far
     _stale: bool = False  # rows of this cycle are stale: the commands are unknown
     _pieces: list[tuple[Floats, Bytes]] = field(default_factory=list)  # pressure (Pa) and phase
 
@@ -58,7 +58,7 @@ class Expectation:
         """Run over the next rows of a cycle; ``at_edge``: suction begins at its first row."""
         if not len(samples):
             return
-        first, self._rows = self._rows == 0, self._rows + len(samples)
+        first, self.rows = self.rows == 0, self.rows + len(samples)
         dt = self._steps.over(samples)
         self._stale |= bool((samples["quality"] & STALE).any())
         if self._stale or (first and samples["quality"][0] & BREAK):
@@ -77,7 +77,7 @@ class Expectation:
 
         None until the model has settled, and for rows that did not begin at a suction edge.
         """
-        pieces, self._pieces, self._rows, self._stale = self._pieces, [], 0, False
+        pieces, self._pieces, self.rows, self._stale = self._pieces, [], 0, False
         if self._solver is None:
             return None
         self._edges += at_edge

@@ -1,7 +1,7 @@
 """Cycles cut out of the stream, and the figures of each."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -15,6 +15,7 @@ from twin.model.theta import Theta
 from twin.quality import BREAK, UNUSABLE, Quality
 from twin.signals import MBAR, NS, Phase, Samples, Ticks, deviation, joined
 
+BATCH = 250  # fewest new rows for which models run ahead: each call has a fixed cost
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
 FEWEST_ROWS = 20  # of a phase, to judge it
 STALE = int(Quality.STALE)  # plain integers: NumPy compares bytes with them
@@ -97,7 +98,7 @@ class Told(Protocol):
 class Teller(Protocol):
     """A source of key figures."""
 
-    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+    def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
         """Process the rows so far of the next piece, to spread the work.
 
         ``at_edge``: they begin with a suction edge.
@@ -117,6 +118,7 @@ class CycleCutter:
     longest: float = LONGEST_PIECE
     _parts: list[tuple[Samples, Ticks]] = field(default_factory=list)
     _count: int = 0  # rows in them
+    _shown: int = 0  # of these rows, those that ``begun`` has given
     _phase: int = Phase.SUCTION  # of the newest row; the first row cannot begin a cycle
     _index: int = -1  # of the collected cycle; −1 before the first suction edge
     _at_edge: bool = False  # the collected rows begin with a suction edge
@@ -139,10 +141,16 @@ class CycleCutter:
                 yield self._cut(bool(edges[end]), bool(breaks[end]))
             begin = end
 
-    @property
-    def begun(self) -> tuple[Sequence[tuple[Samples, Ticks]], bool]:
-        """Rows of the cycle that has not ended, and whether they begin with a suction edge."""
-        return self._parts, self._at_edge
+    def begun(self) -> tuple[Samples, Ticks, bool] | None:
+        """Rows so far of the unfinished piece, and whether they begin with a suction edge.
+
+        None until BATCH rows are new since the last call that gave rows.
+        """
+        if self._count - self._shown < BATCH:
+            return None
+        self._shown = self._count
+        self._parts = [self._joined()]
+        return *self._parts[0], self._at_edge
 
     def flush(self) -> Iterator[Cycle]:
         """Give the remaining rows as a cycle; it is complete if it had come to idle."""
@@ -163,6 +171,11 @@ class CycleCutter:
             self._parts.append((samples, ticks))
             self._count += len(samples)
 
+    def _joined(self) -> tuple[Samples, Ticks]:
+        """The collected rows in one piece."""
+        samples, ticks = zip(*self._parts, strict=True)
+        return joined(*samples), joined(*ticks)
+
     def _cut(self, at_edge: bool = False, at_break: bool = False) -> Cycle:
         """The collected rows as a cycle; the next row is at an edge, at a break, or neither."""
         begins, self._at_edge = self._at_edge, at_edge and not at_break
@@ -170,8 +183,8 @@ class CycleCutter:
         settled = self._edges_on_end >= 2
         if at_break:
             self._edges_on_end = 0
-        samples, ticks = (joined(*column) for column in zip(*self._parts, strict=True))
-        self._parts, self._count = [], 0
+        samples, ticks = self._joined()
+        self._parts, self._count, self._shown = [], 0, 0
         self._index += begins
         whole = begins and int(ticks["phase"][-1]) in (IDLE, BLOW_OFF)
         cut_short = not self._at_edge and len(samples) < self.longest

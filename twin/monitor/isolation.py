@@ -157,9 +157,9 @@ class Isolation:
         """What the last cycle said, and its scores as standard normal variables."""
         return self._kept[-1], self._scored[-1]
 
-    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
-        """See the rows so far of the next cycle, to have less to do when it comes."""
-        self._bank.ahead(parts, at_edge)
+    def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
+        """Process the rows so far of the next piece, to spread the work."""
+        self._bank.run_ahead(samples, ticks, at_edge)
 
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":

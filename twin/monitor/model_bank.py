@@ -24,9 +24,8 @@ from twin.monitor.cycles import Cycle
 from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Stretches
 from twin.monitor.rows import time_steps
 from twin.quality import BREAK
-from twin.signals import MS, NS, Phase, Samples, Ticks, joined
+from twin.signals import MS, NS, Phase, Samples, Ticks
 
-BATCH = 250  # fewest rows processed together: each call has a fixed cost
 SWUNG_IN = 2  # cycles after which the models have forgotten their initial state
 STEP = 0.25  # of a parameter's typical size
 # A delay shifts steep edges. The response is linear only while the shift is shorter than the edge,
@@ -158,26 +157,19 @@ class ModelBank:
         self._since = 0  # rows from the last breakpoint to the newest row
         self._drawn_until_ns = 0  # PLC time of the newest subsampled row
         self._clean_cycles = 0  # cycles in a row without an odd row
-        self._seen = 0  # rows of the next piece
-        self._stepped = 0  # rows of it that were stepped over
+        self._stepped = 0  # rows of the next piece that were stepped over
         self._expected = np.empty((0, self._theta.shape[1]))  # at its subsampled rows
 
-    def ahead(self, parts: Sequence[tuple[Samples, Ticks]], at_edge: bool) -> None:
+    def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
         """Process the rows so far of the next piece, to spread the work.
 
         ``at_edge``: they begin with a suction edge. Nothing is stepped while the piece may still
         run like a cached cycle.
         """
-        rows = sum(len(samples) for samples, _ in parts)
-        if rows - self._seen < BATCH:
-            return
-        self._seen = rows
-        samples, ticks = (joined(*column) for column in zip(*parts, strict=True))
         drawn, stretches, _ = self._look(samples, ticks)
         if not (at_edge and stretches and self._drawings.may_be(stretches)):
-            self._step_to(
-                rows - 1, samples, ticks, drawn
-            )  # the phase after the last row is not known yet
+            end = len(samples) - 1  # the phase after the last row is not known yet
+            self._step_to(end, samples, ticks, drawn)
 
     def take(self, cycle: Cycle) -> tuple[Ints, Floats]:
         """Subsampled rows of a cycle or piece, and expected pressures (Pa) there.
@@ -200,7 +192,7 @@ class ModelBank:
                 self._drawings.add(CachedPrediction(stretches, drawn, expected, self._state.copy()))
         self._clean_cycles = self._clean_cycles + 1 if stretches else 0
         self._last_ns, self._phase, self._since = cycle.end_ns, int(ticks["phase"][-1]), since
-        self._seen, self._stepped, self._expected = 0, 0, self._expected[:0]
+        self._stepped, self._expected = 0, self._expected[:0]
         return drawn, expected
 
     def _look(self, samples: Samples, ticks: Ticks) -> tuple[Ints, Stretches | None, int]:
@@ -208,8 +200,8 @@ class ModelBank:
 
         Stretches are None if a row has a quality flag, or if time steps are uneven.
         """
-        last_ns = int(samples["time_ns"][0]) if self._last_ns is None else self._last_ns
-        result = _analyse(samples, ticks, last_ns, self._phase, self._since)
+        dt = time_steps(samples, self._last_ns)
+        result = _analyse(samples, ticks, dt, self._phase, self._since)
         drawn, has_odd_rows, first, shapes, since = result
         phases = ticks["phase"][first].tobytes()
         return drawn, None if has_odd_rows else Stretches(first, phases, shapes), since
@@ -235,20 +227,19 @@ class ModelBank:
 
 @compiled
 def _analyse(
-    samples: Samples, ticks: Ticks, last_ns: int, phase: int, since: int
+    samples: Samples, ticks: Ticks, dt: Floats, phase: int, since: int
 ) -> tuple[Ints, bool, Ints, Floats, int]:
     """Subsampled rows, whether a row is odd, stretches between breakpoints, rows since the last.
 
-    A stretch has its first row and its shape (``Stretches``). ``last_ns`` and ``phase`` are those
-    of the row before; ``since`` counts rows from the last breakpoint to it.
+    A stretch has its first row and its shape (``Stretches``). ``dt`` are the rows' ``time_steps``.
+    ``phase`` is that of the row before; ``since`` counts rows from the last breakpoint to it.
     """
     bends, first = np.empty(len(samples), np.bool_), np.empty(len(samples), np.int64)
     shapes = np.empty((len(samples), 3))
     has_odd_rows, count, since_bend = False, 0, since
     for i in range(len(samples)):
         row, row_phase, level = samples[i], ticks[i].phase, ticks[i].level
-        dt = (row.time_ns - last_ns) * NS
-        is_uneven = row.quality & BREAK != 0 or dt < 0.5 * MS or dt > 1.5 * MS
+        is_uneven = dt[i] < 0.5 * MS or dt[i] > 1.5 * MS  # a break has a negative step
         bends[i] = is_uneven or math.isfinite(level) or row_phase != phase
         has_odd_rows |= is_uneven or row.quality != 0
         since_bend += 1
@@ -259,7 +250,7 @@ def _analyse(
             begin = first[count - 1]
             shapes[count - 1, 0] = i - begin
             shapes[count - 1, 1] = (row.time_ns - samples[begin].time_ns) * (NS / MS)  # pyright: ignore[reportAttributeAccessIssue]
-        last_ns, phase = row.time_ns, row_phase
+        phase = row_phase
     return (
         sparse_rows(bends, since),
         has_odd_rows,

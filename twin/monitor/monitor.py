@@ -176,10 +176,11 @@ class Monitor:
             else:
                 events += new_events
         yield samples[part:], ticks[part:], in_order(events)
-        if self.teller:
-            self.teller.ahead(*self._cutter.begun)
-        if self.isolation:
-            self.isolation.ahead(*self._cutter.begun)
+        if begun := self._cutter.begun():
+            if self.teller:
+                self.teller.run_ahead(*begun)
+            if self.isolation:
+                self.isolation.run_ahead(*begun)
 
     def _watch(self, samples: Samples, ticks: Ticks) -> list[Event]:
         """Events of rows; only the first row may have a break before it."""
