@@ -211,7 +211,7 @@ def _beside_rivals(
             current = replace(current, found=found)
         visited.add(current.found.kind)
         rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
-        if current.found.effects == (WEATHER,):
+        if _is_weather_alone(current.found):
             return _weather_or_rival(evidence, fitted, current, rivals[0])
         better = _overtaking(current.found, rivals)
         if better is None or better.kind in visited:
@@ -414,6 +414,11 @@ def _with_weather_weights(
     return min(fit(evidence, weights, starts), key=lambda candidate: candidate.score).hypothesis
 
 
+def _is_weather_alone(fitted: Fitted) -> bool:
+    """Whether another ambient pressure is the only cause."""
+    return fitted.effects == (WEATHER,)
+
+
 def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
     """Fits by another ambient pressure, if that is not measured.
 
@@ -422,7 +427,7 @@ def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
     """
     if "ambient" in evidence.told:
         return []
-    return [candidate for candidate in ranked if candidate.effects == (WEATHER,)]
+    return [candidate for candidate in ranked if _is_weather_alone(candidate)]
 
 
 def _started(
@@ -575,7 +580,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         ]
         alternatives = fit(evidence, weights, without) if without[0] else []
         without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
-        if found.effects == (WEATHER,):
+        if _is_weather_alone(found):
             gains = [_weather_gain(evidence, unseen, found.hypothesis)]
         else:
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
