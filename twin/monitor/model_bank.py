@@ -23,7 +23,6 @@ from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
 from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Stretches
 from twin.monitor.rows import time_steps
-from twin.quality import BREAK
 from twin.signals import MS, NS, Phase, Samples, Ticks
 
 SWUNG_IN = 2  # cycles after which the models have forgotten their initial state
