@@ -26,8 +26,9 @@ from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import gain, judge
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.linear_screening import signatures
+from twin.diagnosis.onset import tried_in_or_out
 from twin.diagnosis.residual_covariance import covariance, levels
-from twin.diagnosis.search import _about, _confirmed, held_out_gain, tried_in_or_out
+from twin.diagnosis.search import _about, _confirmed, held_out_gain
 from twin.diagnosis.unlisted import Unlisted, look
 from twin.model import theta as c
 from twin.model.courses import Cause, Course

@@ -8,7 +8,7 @@ the search starts again with the next.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 
@@ -20,9 +20,8 @@ from twin.diagnosis.evidence import (
     Hypothesis,
     LogCycles,
     at_once,
-    thinned,
 )
-from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
+from twin.diagnosis.fit import Fitted, fit, interval, white
 from twin.diagnosis.hypotheses import (
     bounds,
     by_each_law,
@@ -40,13 +39,13 @@ from twin.diagnosis.linear_screening import (
     promises,
     signatures,
 )
+from twin.diagnosis.onset import onset_interval, sharp_onset, with_fine_onsets, with_times
 from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
 from twin.model.effects import WEATHER
 from twin.monitor.bins import Floats
-from twin.signals import MS
 
 MOST_CAUSES = 3
 MOST_ROUNDS = 4  # of adding and pruning
@@ -63,7 +62,7 @@ TRIED_ALONE = 5  # hypotheses that are compared with weights about themselves
 NEAR = 2.5  # times the least score, up to which they are
 QUIET = 1.2  # leftover (sigmas) below which no comparison is needed
 HOPEFUL = 5.0  # least gain (chi-square) of one more cause in the linear model
-TRIED_PAIRS, TRIED_MORE, TRIED_TIMES = 12, 8, 6
+TRIED_PAIRS, TRIED_MORE = 12, 8
 # Leftover (sigmas) of the best single cause above which sizes are too large for a linear model to
 # tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4.
 GREAT = 10.0
@@ -71,11 +70,6 @@ SECOND = 0.5  # of the best gain, above which an effect's second course is fitte
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.4, 4.0])  # typical sizes from which a fit starts
 START_OF_TIMES = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # the same for delays, far from linear
-MOST_FLIPS = 3  # rounds of a search for the cycles of an intermittent cause
-WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
-ONSETS, MANY_ONSETS = 16, 64  # tried in a round of a search for an onset
-ONSET_S = 0.01  # resolution of the first search for an onset
-FARTHEST_S = 4.0  # largest distance of an onset's interval from it
 
 Progress = Callable[[str], None]
 _NO_SIZES = np.empty(0), np.empty(0)
@@ -136,7 +130,7 @@ def search(
     current, rivals = with_rivals
     found = current.found
     onsets = [
-        _onset_interval(evidence, current.judged, found.hypothesis, number, found.leftover)
+        onset_interval(evidence, current.judged, found.hypothesis, number, found.leftover)
         for number in range(len(found.hypothesis))
     ]
     ends = _size_intervals(evidence, current.weights, found)
@@ -206,7 +200,7 @@ def _beside_rivals(
     visited = set[frozenset[tuple[str, Course]]]()
     while True:
         if any(cause.course == Course.STEP for cause in current.found.hypothesis):
-            timed = _finely_timed(evidence, current.judged, current.found.hypothesis)
+            timed = with_fine_onsets(evidence, current.judged, current.found.hypothesis)
             (found,) = fit(evidence, current.weights, [timed])
             current = replace(current, found=found)
         visited.add(current.found.kind)
@@ -340,7 +334,7 @@ def _fit_singles(
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
-    tried = fit(evidence, weights, _timed(evidence, judged, started))
+    tried = fit(evidence, weights, with_times(evidence, judged, started))
     if min(candidate.leftover for candidate in tried) < GREAT:
         return tried
     progress("what acts is great: fitting each cause with every course")
@@ -348,7 +342,7 @@ def _fit_singles(
     started = _started(
         evidence, judged, [hypothesis for hypothesis in more if hypothesis not in hypotheses]
     )
-    return tried + fit(evidence, weights, _timed(evidence, judged, started))
+    return tried + fit(evidence, weights, with_times(evidence, judged, started))
 
 
 def _likeliest(
@@ -479,7 +473,7 @@ def _best_addition(
     if len(hypothesis) == 1:
         candidates += _linear_pairs(evidence, judged, columns(evidence, judged, alone))
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
-    candidates = _timed(evidence, judged, candidates)
+    candidates = with_times(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
     for candidate in tried:
         if _worth(current.healthy, found.chi2, found.chi2 - found.score, candidate):
@@ -656,7 +650,7 @@ def _rivals(
                 and _can_join(evidence, candidate.hypothesis[0], remaining)
                 and candidate.gain > NEARLY * promised[0].gain
             ][:TRIED_PAIRS]
-            timed = _timed(evidence, judged, tried)
+            timed = with_times(evidence, judged, tried)
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
         else:
             fitted = [candidate for candidate in singles if candidate.effects != found.effects]
@@ -669,167 +663,13 @@ def _rivals(
     return at_once(instead_of, range(len(found.hypothesis)))
 
 
-# --- when -----------------------------------------------------------------------------------------
-
-
-def _timed(
-    evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
-) -> list[Hypothesis]:
-    """Hypotheses; the first few have their onset within a cycle, or their cycles, fitted."""
-    result, timed = [], 0
-    for hypothesis in hypotheses:
-        adjust = _PLACED.get(hypothesis[-1].course)
-        if adjust is not None and timed < TRIED_TIMES:
-            result.append(adjust(evidence, judged, hypothesis))
-            timed += 1
-        else:
-            result.append(hypothesis)
-    return result
-
-
-def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """A hypothesis with the best onset of its last cause, within a cycle of the present one."""
-    *others, cause = hypothesis
-    return (*others, _with_best_onset(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
-
-
-def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """A hypothesis with the best cycles of its last cause: each is tried in and out.
-
-    Unjudged cycles are tried as well: a cause in them affects the gas of the next cycle.
-    """
-    *others, cause = hypothesis
-    units = tried_in_or_out(evidence)
-    cause = replace(cause, cycles=_union(unit for unit in units if max(unit) in cause.cycles))
-    for _ in range(MOST_FLIPS):
-        tried = [cause, *(replace(cause, cycles=cause.cycles ^ unit) for unit in units)]
-        chi2 = np.sum(white(evidence, judged, [(*others, trial) for trial in tried]) ** 2, axis=0)
-        gains = chi2[0] - chi2[1:]
-        better = _union(
-            unit for unit, gain in zip(units, gains, strict=True) if gain > WORTH_FLIPPING
-        )
-        if not better:
-            break
-        combined = replace(cause, cycles=cause.cycles ^ better)
-        finalists = [combined, tried[int(np.argmin(chi2))]]
-        chi2 = np.sum(
-            white(evidence, judged, [(*others, finalist) for finalist in finalists]) ** 2, axis=0
-        )
-        cause = finalists[int(np.argmin(chi2))]
-    return (*others, cause)
-
-
-def tried_in_or_out(evidence: Evidence) -> list[frozenset[int]]:
-    """Sets of cycles to flip: each cycle, after a gap with the one in which the model settles."""
-    numbers = [int(number) for number in evidence.numbers]
-    units, before = [], frozenset[int]()
-    for position, number in enumerate(numbers):
-        follows_a_gap = position > 0 and number > numbers[position - 1] + 1
-        if follows_a_gap and position not in evidence.judged:
-            before = frozenset({number})
-        else:
-            units.append(before | {number})
-            before = frozenset()
-    return units
-
-
-def _union(cycles: Iterable[frozenset[int]]) -> frozenset[int]:
-    return frozenset[int]().union(*cycles)
-
-
-_PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
-
-
-def _finely_timed(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
-    """A hypothesis with the onset of every step searched to the row, with known sizes."""
-    for number, cause in enumerate(hypothesis):
-        if cause.course == Course.STEP:
-            others = (*hypothesis[:number], *hypothesis[number + 1 :])
-            begun = _with_best_onset(evidence, judged, others, cause, MANY_ONSETS, MS)
-            hypothesis = (*hypothesis[:number], begun, *hypothesis[number + 1 :])
-    return hypothesis
-
-
-def _with_best_onset(
-    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, count: int, fine: float
-) -> Cause:
-    """A cause with its best onset, within a cycle of the present one; ``count`` in round one."""
-    cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
-    low, high = cause.onset_s - cycle, cause.onset_s + cycle
-    while (high - low) / count > fine:
-        onsets = np.linspace(low, high, count)
-        best = onsets[int(np.argmin(_misfits(evidence, judged, others, cause, onsets)))]
-        cause = replace(cause, onset_s=float(best))
-        reach, count = 1.5 * (high - low) / count, ONSETS
-        low, high = best - reach, best + reach
-    return cause
-
-
 def sharpened(whole: LogCycles, part: Evidence, searched: Search) -> Search:
     """The result for ``part`` of a log, with onsets of steps from all its cycles."""
     found, onsets = searched.found, list(searched.onsets)
     assert found is not None
     for number, cause in enumerate(found.hypothesis):
         if cause.course == Course.STEP:
-            hypothesis, onsets[number] = _sharp_onset(whole, part, found, number)
+            hypothesis, onsets[number] = sharp_onset(whole, part, found, number)
             found = replace(found, hypothesis=hypothesis)
     residual_covariance = covariance(part, found.hypothesis)
     return replace(searched, known=residual_covariance, found=found, onsets=onsets)
-
-
-def _sharp_onset(
-    whole: LogCycles, part: Evidence, found: Fitted, number: int
-) -> tuple[Hypothesis, tuple[float, float]]:
-    """A hypothesis with the best onset of one of its causes, and the onset's interval."""
-    cause, hypothesis = found.hypothesis[number], found.hypothesis
-    others = (*hypothesis[:number], *hypothesis[number + 1 :])
-    begins = whole.begins
-    cycle_starts = part.seconds[part.starts[part.judged]]
-    index = int(np.searchsorted(cycle_starts, cause.onset_s))
-    low = cycle_starts[index - 2] if index >= 2 else begins[whole.judged[0]]
-    high = cycle_starts[index + 1] if index + 1 < len(cycle_starts) else np.inf
-    while True:
-        inside = [cycle for cycle in whole.judged if low <= begins[cycle] <= high]
-        selected = thinned(whole, inside, ONSETS)
-        judged = covariance(selected, (*others, cause)).of(selected.judged)
-        tried = selected.seconds[selected.starts[selected.judged]]
-        best = int(np.argmin(_misfits(selected, judged, others, cause, tried)))
-        cause = replace(cause, onset_s=float(tried[best]))
-        if len(inside) <= ONSETS:
-            break
-        low, high = tried[max(best - 2, 0)], tried[min(best + 2, len(tried) - 1)]
-    cause = _with_onset(selected, judged, (*others, cause))[-1]
-    hypothesis = (*hypothesis[:number], cause, *hypothesis[number + 1 :])
-    return hypothesis, _onset_interval(selected, judged, hypothesis, number, found.leftover)
-
-
-def _misfits(
-    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, onsets: Floats
-) -> Floats:
-    tried = [(*others, replace(cause, onset_s=float(onset))) for onset in onsets]
-    chi2: Floats = np.sum(white(evidence, judged, tried) ** 2, axis=0)
-    return chi2
-
-
-def _onset_interval(
-    evidence: Evidence, judged: Weights, hypothesis: Hypothesis, number: int, leftover: float
-) -> tuple[float, float]:
-    """95 % profile-likelihood interval (s) of a step's onset.
-
-    Sizes are fitted for each onset.
-    """
-    cause = hypothesis[number]
-    if cause.course != Course.STEP:
-        return cause.onset_s, cause.onset_s
-    sampled = float(np.median(np.diff(evidence.seconds)))
-    reach = np.geomspace(max(ONSET_S, sampled), FARTHEST_S, 10)
-    onsets = cause.onset_s + np.concatenate([-reach[::-1], [0.0], reach])
-    begun = [
-        (*hypothesis[:number], replace(cause, onset_s=float(onset)), *hypothesis[number + 1 :])
-        for onset in onsets
-    ]
-    misfit = profiled(evidence, judged, begun)
-    inside = np.flatnonzero(misfit < misfit.min() + CHI2_95 * max(leftover**2, 1.0))
-    inside = np.union1d(inside, len(reach))  # the onset itself
-    last = len(onsets) - 1  # the first that is rejected bounds it
-    return float(onsets[max(inside[0] - 1, 0)]), float(onsets[min(inside[-1] + 1, last)])
