@@ -28,7 +28,7 @@ from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
 from twin.assets.unit import Unit
 from twin.cli.console import Console
-from twin.cli.run import _supervised
+from twin.cli.sinks import supervised
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.figures.database import open_store
@@ -359,7 +359,7 @@ class Beside:
 
         setattr(outputs[output], name, failing)
         alarms = outputs.pop("alarms")
-        sinks, advisers = _supervised(outputs, {"alarms": alarms}, notices)
+        sinks, advisers = supervised(outputs, {"alarms": alarms}, notices)
 
         def source() -> Iterator[Samples]:
             for block in rigs.cut(rows(), BLOCK):

@@ -4,7 +4,7 @@ import gc
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,6 @@ import typer
 from twin.cli.alarms import alarms_of, asker_of, limit_changes_of
 from twin.cli.app import positive
 from twin.cli.console import Console, hint, no_status, printers, status
-from twin.cli.figures import keeper_of
 from twin.cli.notifications import outlets_of
 from twin.cli.options import (
     PAGE,
@@ -27,9 +26,9 @@ from twin.cli.options import (
     UnitId,
     ViewFlag,
 )
-from twin.cli.serve import live_rows_of, reports_of
+from twin.cli.serve import reports_of
 from twin.cli.setup import configured
-from twin.cli.sinks import open_sinks, views_of
+from twin.cli.sinks import live_sinks, outlet_sinks, supervised, views_of
 from twin.cli.stopping import closed, leave, stop_on_signal, until
 from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Kind
@@ -40,12 +39,10 @@ from twin.service import Service
 if TYPE_CHECKING:
     from sqlalchemy import URL
 
-    from drivers.outputs.state import Results
     from drivers.outputs.writer import Writer
     from twin.acquisition import Acquisition
     from twin.alarms.limit_changes import LimitChanges
     from twin.cli.compiling import Models
-    from twin.cli.notifications import Begin, Standing
     from twin.config import Config
     from twin.live import EventEnricher, Sink
     from twin.monitor.staleness import Listening, Notices
@@ -130,16 +127,8 @@ def run(
             rows = closing.enter_context(
                 _acquired(until(stopped, source), models.compiling, plc.listening)
             )
-            # The log comes last: messages to people do not wait for the disk.
-            opened = open_sinks(
-                {
-                    "console": lambda: consoles[name],
-                    "OPC UA results": (lambda: results) if results else None,
-                    "key figures": keeper_of(settings, complain),
-                    "live page": live_rows_of(settings, complain, file),
-                    "view": view_of(name),
-                    "log": partial(_recorder, file, settings, hil=hil) if file else None,
-                }
+            opened = live_sinks(
+                settings, consoles[name], results, file, view_of(name), complain, hil=hil
             )
             closing.enter_context(
                 _retained(settings, opened.get("log"), plc.listening.notices, complain)
@@ -152,10 +141,8 @@ def run(
             )
             limits = None if hil else limit_changes_of(settings, board)
             enrichers |= {"limits": limits} if limits else {}
-            outlet_sinks = {} if hil else _outlet_sinks(board.standing(), results, outlets)
-            sinks, advisers = _supervised(
-                {**outlet_sinks, **opened}, enrichers, plc.listening.notices
-            )
+            reached = {} if hil else outlet_sinks(board.standing(), results, outlets)
+            sinks, advisers = supervised({**reached, **opened}, enrichers, plc.listening.notices)
             _loop(name, models, rows, plc.listening, sinks, advisers, stopped, limits)
 
     failed: list[str] = []
@@ -317,18 +304,6 @@ def _written_folders(settings: "Config", log: Path | None) -> set[Path]:
     return {folder.resolve() for folder in [*logs, *(Path(file).parent for file in files)]}
 
 
-def _recorder(file: Path, settings: "Config", *, hil: bool) -> "Sink":
-    """The recorder of a live run's log."""
-    from twin.log.header import HIL, RECORDED
-    from twin.log.recorder import Recorder
-
-    rotate = round(settings.log.rotate_mb * 1e6)
-    metadata = {RECORDED: "twin run"}
-    if hil:
-        metadata[HIL] = "the pressure is the model's own, as it was written to the PLC"
-    return Recorder(file, settings.log_header(metadata), rotate_bytes=rotate)
-
-
 def _retained(
     settings: "Config",
     log: "Sink | None",
@@ -381,36 +356,6 @@ def _answering(
 
     plant = Plant(coefficients(settings.data), settings.data.terms)
     return in_place(source, plant, lambda *values: writer.put(Outputs(*values)))
-
-
-def _supervised(
-    sinks: "Mapping[str, Sink]", advisers: "Mapping[str, EventEnricher]", notices: "Notices"
-) -> "tuple[list[Sink], list[EventEnricher]]":
-    """The same with supervision: a failure of one does not end the run."""
-    from twin.log.recorder import Recorder
-    from twin.supervised import Outages, SupervisedEnricher, SupervisedSink
-
-    outages = Outages(notices)
-
-    def supervised(name: str, sink: "Sink") -> "Sink":
-        if isinstance(sink, Recorder):
-            return SupervisedSink(name, sink, sink.again, outages, held=lambda: sink.held)
-        rows = not isinstance(sink, Console)
-        return SupervisedSink(name, sink, lambda: sink, outages, rows=rows)
-
-    return (
-        [supervised(*item) for item in sinks.items()],
-        [SupervisedEnricher(name, enricher, outages) for name, enricher in advisers.items()],
-    )
-
-
-def _outlet_sinks(
-    standing: "Standing", results: "Results | None", outlets: "Begin | None"
-) -> "dict[str, Sink]":
-    """Report the alarms that stand when a run begins; gives the sinks for further alarms."""
-    if results is not None:
-        results.resume(standing, time.time_ns())
-    return {} if outlets is None else {"MQTT and webhook": outlets(standing)}
 
 
 @contextmanager
