@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from twin.model import system
 from twin.model.dataset import Ambient, Ejector, Supply, System, Wiring
+from twin.model.parts import Cups, Filter, Sensor, Tee, Tube, Vessel
 
 PAGE = (Path(__file__).parents[1] / "docs" / "data-set.md").read_text(encoding="utf-8")
-PARTS = (system.Tube, system.Tee, system.Filter, system.Sensor, system.Vessel, system.Cups)
+PARTS = (Tube, Tee, Filter, Sensor, Vessel, Cups)
 TABLES = (Ambient, Ejector, Supply, System, Wiring, *PARTS)
 
 

@@ -22,7 +22,7 @@ from twin.config import Config
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients, sensor_place
-from twin.model.system import Cups, Filter, Sensor, Tube, Vessel
+from twin.model.parts import Cups, Filter, Sensor, Tube, Vessel
 from twin.signals import MBAR, ML, MS, Reported, Samples
 
 # Seeds of the second world: a gripper, a tank without air saving, a closed tank.

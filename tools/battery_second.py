@@ -27,7 +27,7 @@ from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.errors import TwinError
 from twin.model.dataset import DataSet
-from twin.model.system import volume
+from twin.model.parts import volume
 from twin.monitor.healthy import Healthy
 from twin.settings import Document
 from twin.signals import MBAR, ML, MS, SL_MIN, Samples

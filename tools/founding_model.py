@@ -26,7 +26,7 @@ from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE, Space, directions
 from twin.diagnosis.drawing import AFTER, ANONYMOUS, BEFORE, EACH, MEASURED, QUIET, STYLE
 from twin.model.dataset import DataSet
-from twin.model.system import Vessel
+from twin.model.parts import Vessel
 from twin.monitor.bins import Floats
 from twin.signals import MBAR, NS, Samples
 

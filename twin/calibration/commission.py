@@ -36,7 +36,7 @@ from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, sensor_place
 from twin.model.effects import standing_for
 from twin.model.gas import GAMMA, R
-from twin.model.system import Cups, Part, Sensor, Tube, volume
+from twin.model.parts import Cups, Part, Sensor, Tube, volume
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in

@@ -22,7 +22,7 @@ from twin.calibration.residual_covariance import Weights, plain, weighted
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
-from twin.model.system import Tube
+from twin.model.parts import Tube
 from twin.quality import UNUSABLE
 from twin.signals import MBAR, MS, NS, Samples
 

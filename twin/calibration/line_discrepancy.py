@@ -6,7 +6,7 @@ more cycles do not reduce it. So the intervals must include it.
 
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.model.system import lumped
+from twin.model.parts import lumped
 from twin.model.theta import Theta
 
 

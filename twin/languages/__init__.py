@@ -1,1 +1,4 @@
-"""Languages of texts for people. A new one is a catalogue: ``python tools/texts.py fr``."""
+"""Languages of texts for people. The translations are in ``twin/locale``, such as ``de.po``.
+
+A new language is a catalogue: ``python tools/texts.py fr``.
+"""

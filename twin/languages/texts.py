@@ -1,7 +1,7 @@
 """The language of texts for people, and its notation of numbers: English, unless chosen otherwise.
 
-A text is its own key, as in gettext. Each task and thread has its own choice, and inherits the one
-of its creator.
+A text is its own key, as in gettext; ``twin/locale`` has its translations. Each task and thread has
+its own choice, and inherits the one of its creator.
 """
 
 import re

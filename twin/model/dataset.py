@@ -19,7 +19,7 @@ from twin.model import theta as c
 from twin.model.catalogue import CatalogueEffect, refuse_name
 from twin.model.effects import FLATTEST, apply
 from twin.model.gas import CRITICAL_RATIO, GAMMA, R
-from twin.model.system import Part, Tube, Vessel, lumped
+from twin.model.parts import Part, Tube, Vessel, lumped
 from twin.model.term import Term
 from twin.model.theta import Theta
 from twin.settings import Settings

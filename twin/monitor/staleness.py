@@ -1,7 +1,8 @@
 """Staleness by one clock: the time that the twin has listened without a fresh row.
 
 The clock is monotonic, whatever happens to the wall clock. It stops while the twin is busy with
-something else. Rows carry the decision (``Quality.OURS``), so that a replay decides the same.
+something else. The limit is ``[monitor] stale_ms``. Rows carry the decision (``Quality.OURS``), so
+that a replay decides the same.
 """
 
 import time

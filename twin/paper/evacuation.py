@@ -16,7 +16,7 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, Ejector, System, coefficients
 from twin.model.gas import R
-from twin.model.system import Part, Sensor, Tube, Vessel, area, volume
+from twin.model.parts import Part, Sensor, Tube, Vessel, area, volume
 from twin.signals import MBAR, ML, MS, SL_MIN, Phase
 
 _SHIPPED = {record.name: record.data["ejector"] for record in shipped_records()}

@@ -7,8 +7,8 @@ from difflib import get_close_matches
 from twin.errors import ConfigError, SourceError
 from twin.signals import MBAR, SL_MIN, ZERO_C, Command, Reported
 from twin.tables.likely import as_toml, likely_columns
-from twin.tables.meaning import PRESSURES, SUPPLIES, Meaning, find_meaning
 from twin.tables.settings import Column, ColumnSource, ImportSettings
+from twin.tables.units import PRESSURES, SUPPLIES, Meaning, find_meaning
 
 DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
 TIMES = (*DIGITS, Column.TIME)

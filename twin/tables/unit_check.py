@@ -14,8 +14,8 @@ from twin.errors import SourceError
 from twin.quality import UNUSABLE
 from twin.signals import MBAR, PASCAL, Command, Reference, Samples, Unit, counted_from
 from twin.tables.layout import Layout
-from twin.tables.meaning import Meaning
 from twin.tables.settings import Column, ImportSettings, toml_string
+from twin.tables.units import Meaning
 
 # Ambient is about 1 bar: read as mbar, no absolute pressure or vacuum in bar comes to 2 mbar.
 # No ejector evacuates to as little, and only a dead one leaves as little after a second of suction.

@@ -13,7 +13,7 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet
 from twin.model.gas import CRITICAL_RATIO, VISCOSITY, R, orifice
-from twin.model.system import (
+from twin.model.parts import (
     FRICTION,
     TUBE_LOSS,
     Cups,
