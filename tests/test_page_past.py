@@ -167,7 +167,7 @@ def test_five_minutes_come_from_the_logs_where_the_browser_has_not_seen_them(log
     page.select_option("#window", "300")
     assert page.evaluate("past.on")
     expect(page.locator("#window")).to_have_value("300")
-    assert span(page) == pytest.approx(300.0)
+    assert span(page) == pytest.approx(300.0, abs=0.1)  # rows go on coming
 
 
 def test_without_logs_the_page_says_how_to_have_some(site: Site) -> None:
