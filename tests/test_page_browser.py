@@ -635,7 +635,8 @@ def test_a_step_is_marked_and_a_range_of_time_chosen(site: Site) -> None:
     shown = page.evaluate("trendChart.range()")
     assert begin + 86_399 <= shown[0] <= begin + 86_401
     assert shown[1] <= end
-    expect(page.locator("#trend-from")).to_have_value(from_)
+    without_seconds = from_.removesuffix(":00")  # as a browser may shorten them
+    expect(page.locator("#trend-from")).to_have_value(re.compile(f"^{without_seconds}(:00)?$"))
 
 
 def _kept_figures(site: Site, step: float = 0.0) -> None:

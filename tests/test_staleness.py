@@ -263,6 +263,33 @@ def test_what_follows_silence_of_both_kinds_is_one_silence() -> None:
     assert sorted(live.events, key=str) == sorted(replayed.events, key=str)
 
 
+def test_a_plc_that_goes_between_its_answer_and_its_first_row_is_stale() -> None:
+    """The run has its answer over one connection, and its rows over the next."""
+    samples = healthy().copy()
+    samples["host_ns"][6000:] += 3 * S
+    timed = Timed([*[EMPTY] * 20, *rigs.cut(samples[6000:], 100)])
+    timed.listening.answer.keep(samples[:1])
+    timed.listening.notices.tell(Kind.PLC_LOST, "no answer")
+    live = Collect()
+    run(timed, rigs.twin("test_rig"), rigs.monitor("test_rig"), [live], timed.listening)
+    told = live.of(*STALENESS, Kind.PLC_LOST, Kind.GAP, Kind.TWIN_LATE)
+    assert sorted(kinds(told)) == sorted([*STALENESS, Kind.PLC_LOST, Kind.GAP])
+    logged = np.concatenate(live.samples)
+    assert logged["sequence"][:2].tolist() == [samples["sequence"][0], samples["sequence"][6000]]
+    replayed = rigs.watch("test_rig", rigs.cut(logged, 1000))
+    assert replayed.of(*STALENESS, Kind.GAP) == live.of(*STALENESS, Kind.GAP)
+
+
+def test_the_answer_before_the_first_row_is_not_logged_where_rows_come() -> None:
+    samples = healthy()
+    timed = Timed([EMPTY, *rigs.cut(samples[6000:], 100)])
+    timed.listening.answer.keep(samples[:1])
+    live = Collect()
+    run(timed, rigs.twin("test_rig"), rigs.monitor("test_rig"), [live], timed.listening)
+    assert live.of(*STALENESS, Kind.GAP) == []
+    assert len(np.concatenate(live.samples)) == len(samples) - 6000
+
+
 # Alarms of the twin.
 
 

@@ -165,7 +165,7 @@ def test_garbage_in_a_session(fresh: OpcuaPlc, protocol: str, seed: int) -> None
     settings: Any = fresh.settings(timeout_ms=300)
     port, frame, share = fresh.port, opcua_frame, 0.08
     if protocol == "modbus":
-        settings = by_modbus(fresh.process.port, timeout_ms=50)
+        settings = by_modbus(fresh.process.port, timeout_ms=250)
         port, frame, share = fresh.process.port, modbus_frame, 0.02
     garbler = Garbler(port, frame, seed, share)
     with closing(garbler):

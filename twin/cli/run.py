@@ -202,6 +202,7 @@ class _Plc:
             for block in source:
                 if len(block):
                     self._known = True
+                    self.listening.answer.keep(block)
                     break
                 if stopped(begun=False):
                     return False

@@ -49,6 +49,7 @@ class Listening:
 
     clock: Callable[[], int] = time.perf_counter_ns  # monotonic
     notices: Notices = field(default_factory=Notices)
+    answer: LastRow = field(default_factory=LastRow)  # before the loop; given if none comes to it
     _last: LastRow = field(default_factory=LastRow)  # that is not stale
     _heard_ns: int = 0  # its time of receipt, by ``clock``
     _listened_ns: int = 0  # since then
@@ -72,9 +73,16 @@ class Listening:
     def _judge(self, block: Samples, monitor: Monitor, now_ns: int) -> tuple[Samples, list[Event]]:
         fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
         last = self._last.row
+        if not len(block) and not len(last) and self._listened_ns > monitor.stale_ns:
+            last = block = self.answer.row
+            self._last.keep(last)
         if not len(fresh):
             return block, monitor.silent(last[0], self._listened_ns) if len(last) else []
         events: list[Event] = []
+        if len(last) and len(self.answer.row) and last == self.answer.row:  # from another stream
+            block = block.copy()
+            is_later = block["time_ns"][0] > last["time_ns"][0]
+            mark(block["quality"], [0], Quality.GAP if is_later else Quality.CLOCK)
         if len(last) and not monitor.is_stale(last[0]):
             first = fresh[:1]
             if (block["host_ns"][first] - last["host_ns"] > monitor.stale_ns).any():
