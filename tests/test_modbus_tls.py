@@ -19,7 +19,7 @@ from drivers.modbus.client import ModbusClient
 from drivers.modbus.plan import Request
 from drivers.modbus.poll_socket import head
 from drivers.modbus.settings import ModbusSettings
-from drivers.modbus.tls import Tls, secured
+from drivers.modbus.tls import PlcTls, secured
 from drivers.opcua import certificates
 from drivers.reconnect import LostError
 from drivers.sources import open_source
@@ -221,13 +221,13 @@ def test_our_own_files_that_are_of_no_use_are_named(tmp_path: Path) -> None:
         port = listener.getsockname()[1]
         certificates.make(tmp_path)
         for changes, said in ((own, "certificate and key"), ({"trusted": broken}, "trusted")):
-            tls = Tls.model_validate({"trusted": tmp_path / certificates.OWN} | changes)
+            tls = PlcTls.model_validate({"trusted": tmp_path / certificates.OWN} | changes)
             connection = socket.create_connection(("127.0.0.1", port))
             with pytest.raises(ConfigError, match=f"{said} {broken}: cannot be used"):
                 secured(connection, tls, f"127.0.0.1:{port}")
             assert connection.fileno() == -1  # it is closed
     with pytest.raises(ValidationError, match="certificate and key belong together"):
-        Tls.model_validate({"trusted": broken, "key": broken})
+        PlcTls.model_validate({"trusted": broken, "key": broken})
 
 
 def test_files_lie_beside_the_configuration(tmp_path: Path) -> None:

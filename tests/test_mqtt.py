@@ -29,7 +29,7 @@ from twin.notifications.message import Message
 from twin.notifications.mqtt import Mqtt
 from twin.notifications.outbox import open_outbox
 from twin.notifications.sender import LostError
-from twin.notifications.settings import MqttSettings, Secret, Tls
+from twin.notifications.settings import MqttSettings, Secret, ServerTls
 from twin.settings import Document
 
 BASE = f"ejector-twin/{UNIT.type}/{UNIT.id}"
@@ -290,10 +290,10 @@ def test_inside_tls(tmp_path: Path) -> None:
     own = certificate(tmp_path)
     lines = ("allow_anonymous true", f"certfile {own}", f"keyfile {own}")
     with broker(tmp_path, *lines) as secured:
-        ours = channel(secured.port, tls=Tls(trusted=own))
+        ours = channel(secured.port, tls=ServerTls(trusted=own))
         ours.open()
         ours.close()
-        stranger = channel(secured.port, tls=Tls())
+        stranger = channel(secured.port, tls=ServerTls())
         with pytest.raises(LostError, match="certificate verify failed"):
             stranger.open()
         stranger.hang_up()

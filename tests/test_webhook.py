@@ -22,7 +22,7 @@ from twin.config import Config
 from twin.errors import ConfigError
 from twin.notifications import sender
 from twin.notifications.sender import LostError, Sent
-from twin.notifications.settings import Secret, Tls, WebhookSettings
+from twin.notifications.settings import Secret, ServerTls, WebhookSettings
 from twin.notifications.webhook import Webhook
 from twin.settings import Document
 
@@ -252,7 +252,7 @@ def test_inside_tls(tmp_path: Path) -> None:
     own = certificate(tmp_path)
     server = Server(certificate=own)
     url = f"https://127.0.0.1:{server.port}/"
-    trusting = Webhook(WebhookSettings(url=url, tls=Tls(trusted=own)), Path(), pytest.fail)
+    trusting = Webhook(WebhookSettings(url=url, tls=ServerTls(trusted=own)), Path(), pytest.fail)
     assert trusting.send([message(1)]).delivered == [message(1)]
     trusting.close()
     stranger = Webhook(WebhookSettings(url=url), Path(), pytest.fail)

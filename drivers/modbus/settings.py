@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.modbus.tls import Tls
+from drivers.modbus.tls import PlcTls
 from drivers.optional_signals import BITS, refuse_unclear
 from drivers.tags import Address, Flow, Place, Pressure, Tag, Temperature, WordOrder
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
@@ -72,7 +72,7 @@ class ModbusSettings(Settings):
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     tags: Tags
     ring: Ring = Ring()
-    tls: Tls | None = None  # Modbus/TCP Security
+    tls: PlcTls | None = None  # Modbus/TCP Security
 
     @model_validator(mode="after")
     def _tags_fit_the_mode(self) -> Self:

@@ -6,13 +6,10 @@ The PLC proves itself by its own certificate or that of the authority that signe
 import socket
 import ssl
 from pathlib import Path
-from typing import Self
-
-from pydantic import model_validator
 
 from drivers.reconnect import LostError
 from twin.errors import ConfigError, SourceError
-from twin.settings import Settings
+from twin.tls import OwnCertificate
 
 PORT = 802  # registered for Modbus/TCP Security
 
@@ -21,28 +18,20 @@ _NOT_YET, _EXPIRED, _WRONG_NAME, _WRONG_ADDRESS = 9, 10, 62, 64
 HANDSHAKE_S = 2.0  # a PLC's processor takes its time for it
 
 
-class Tls(Settings):
+class PlcTls(OwnCertificate):
     """How the connection to the PLC is protected; missing: it is not."""
 
     trusted: Path  # PEM: the PLC's certificate, or the authority's that signed it
     name: str = ""  # in the PLC's certificate; "" means the host
-    certificate: Path | None = None  # PEM, our own, where the PLC requires one
-    key: Path | None = None  # PEM, of our own certificate
 
-    @model_validator(mode="after")
-    def _belong_together(self) -> Self:
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together")
-        return self
-
-    def below(self, folder: Path) -> "Tls":
+    def below(self, folder: Path) -> "PlcTls":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""
         paths = {key: getattr(self, key) for key in ("trusted", "certificate", "key")}
         resolved = {key: folder / path for key, path in paths.items() if path is not None}
         return self.model_copy(update=resolved)
 
 
-def secured(connection: socket.socket, tls: Tls, address: str) -> ssl.SSLSocket:
+def secured(connection: socket.socket, tls: PlcTls, address: str) -> ssl.SSLSocket:
     """Do the TLS handshake on ``connection`` to ``address`` (host:port); closes it on failure.
 
     SourceError if the PLC's certificate is not trusted or the PLC rejects ours, LostError if it
@@ -79,7 +68,7 @@ def _host(address: str) -> str:
 # --- our own files ------------------------------------------------------------------------------
 
 
-def _context(tls: Tls) -> ssl.SSLContext:
+def _context(tls: PlcTls) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_2  # as the protocol has it
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the PLC's own certificate is enough
@@ -111,7 +100,7 @@ def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
 # --- errors of a connection ---------------------------------------------------------------------
 
 
-def _explained(error: OSError, tls: Tls, address: str) -> SourceError:
+def _explained(error: OSError, tls: PlcTls, address: str) -> SourceError:
     if isinstance(error, ssl.SSLCertVerificationError):
         return _untrusted(error, tls, address)
     if isinstance(error, ssl.SSLError) and _refuses(error):
@@ -123,7 +112,7 @@ def _explained(error: OSError, tls: Tls, address: str) -> SourceError:
     )
 
 
-def _untrusted(error: ssl.SSLCertVerificationError, tls: Tls, address: str) -> SourceError:
+def _untrusted(error: ssl.SSLCertVerificationError, tls: PlcTls, address: str) -> SourceError:
     name = tls.name or _host(address)
     if error.verify_code in (_WRONG_NAME, _WRONG_ADDRESS):
         return SourceError(

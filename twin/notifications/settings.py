@@ -12,20 +12,13 @@ from twin.errors import ConfigError
 from twin.notifications.people import Address, Person
 from twin.secret import Say, Secret, refuse_secrets
 from twin.settings import Document, Settings
+from twin.tls import OwnCertificate
 
 
-class Tls(Settings):
+class ServerTls(OwnCertificate):
     """How a connection is protected. ``{}`` trusts whom this machine trusts."""
 
     trusted: Path | None = None  # PEM: the server's certificate, or the authority's
-    certificate: Path | None = None  # PEM, our own, where the server requires one
-    key: Path | None = None  # PEM, of our own certificate
-
-    @model_validator(mode="after")
-    def _belong_together(self) -> Self:
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together")
-        return self
 
     def context(self, table: str, folder: Path) -> ssl.SSLContext:
         """The context of a connection; ConfigError if a file cannot be used."""
@@ -63,7 +56,7 @@ class MqttSettings(Outlet):
 
     host: str = ""  # name or address of the broker
     port: int = Field(default=0, ge=0, le=65535)  # 0: 8883 with tls, else 1883
-    tls: Tls | None = None
+    tls: ServerTls | None = None
     user: str = ""  # name at the broker
     password: Secret | None = None
     unprotected: bool = False  # a password without tls beyond this machine all the same
@@ -94,7 +87,7 @@ class HttpSettings(Settings):
     url: str | Secret = ""
     # That go with each message, each a secret.
     headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
-    tls: Tls = Tls()
+    tls: ServerTls = ServerTls()
     unprotected: bool = False  # headers without https beyond this machine all the same
 
     @model_validator(mode="after")
@@ -155,7 +148,7 @@ class EmailSettings(Outlet):
     port: int = Field(default=0, ge=0, le=65535)  # 0: 587 with starttls, 465 with tls, else 25
     # "tls" from the first byte on, "starttls" after the greeting; without it nothing is sent
     encryption: Literal["starttls", "tls", "none"] = "starttls"
-    tls: Tls = Tls()
+    tls: ServerTls = ServerTls()
     user: str = ""  # name at the mail server
     password: Secret | None = None
     unprotected: bool = False  # a password without encryption beyond this machine all the same

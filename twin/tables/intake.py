@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.errors import SourceError
-from twin.quality import BREAK, Quality
+from twin.quality import BREAK, Quality, mark
 from twin.signals import LastRow, Samples
 from twin.tables.date_time import Calendar
 from twin.tables.decode import Batch, Spoilt, decode
@@ -67,10 +67,10 @@ class Intake:
         self._replace(run, bad, batch)
         breaks = self._find_breaks(run)
         self._refuse(batch, bad, breaks)
-        rows["quality"][np.any(list(bad.values()), axis=0)] |= Quality.BAD.value
-        rows["quality"][breaks.clock] |= Quality.CLOCK.value
-        rows["quality"][breaks.restart] |= Quality.RESTART.value
-        rows["quality"][breaks.gap] |= Quality.GAP.value
+        mark(rows["quality"], np.any(list(bad.values()), axis=0), Quality.BAD)
+        mark(rows["quality"], breaks.clock, Quality.CLOCK)
+        mark(rows["quality"], breaks.restart, Quality.RESTART)
+        mark(rows["quality"], breaks.gap, Quality.GAP)
         self._last.keep(rows)
         return rows
 
