@@ -33,7 +33,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     monkeypatch.chdir(tmp_path)
 
     def command(*arguments: str | Path) -> str:
-        alarms_app([str(one) for one in arguments], standalone_mode=False)
+        alarms_app([str(argument) for argument in arguments], standalone_mode=False)
         return capsys.readouterr().out
 
     return command
@@ -71,7 +71,7 @@ def test_a_comment_and_statistics_need_no_run(run: Run, tmp_path: Path) -> None:
     assert run("comment", LEAK, "new hose ordered", "--by", "ann") == f"{LEAK}: commented\n"
     assert re.search(r"\n {8}ann, .* ago: new hose ordered\n", run("history", "--json", "h.json"))
     (episode,) = json.loads(Path("h.json").read_text())
-    assert [(one["who"], one["text"]) for one in episode["comments"]] == [
+    assert [(comment["who"], comment["text"]) for comment in episode["comments"]] == [
         ("ann", "new hose ordered")
     ]
     with pytest.raises(ConfigError, match="plc_stale does not stand"):
@@ -148,7 +148,7 @@ def test_without_a_run_the_next_one_does_it(
     run("unshelve", "plc_stale")
     keeper = Keeper(lambda: open_store("alarms.sqlite"), UNIT, pytest.fail)
     alarms = Alarms(board_rules(None), lambda: APART + 9 * S, keeper.begin(), keeper)
-    said_there = [one.data["deed"] for _ in range(500) for one in _later(alarms)]
+    said_there = [event.data["deed"] for _ in range(500) for event in _later(alarms)]
     alarms.close()
     assert said_there == ["acknowledged"]
     assert f"{LEAK}  acknowledged" in run("list")

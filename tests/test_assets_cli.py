@@ -91,7 +91,7 @@ def test_what_is_added_is_listed_and_shown(run: Run, unit: Path) -> None:
     table = rows(run("list"))
     added = next(row for row in table if row[1] == "unit-1")
     assert [row[:4] for row in table] == [
-        *([*one, TYPE, "always"] for one in SHIPPED),
+        *([*shipped, TYPE, "always"] for shipped in SHIPPED),
         ["instance", "unit-1", TYPE, "2026-05-01T12:00:00Z"],
     ]
     shown = run("show", "unit-1")
@@ -392,7 +392,7 @@ def test_a_named_database_that_is_not_there_is_not_passed_over(run: Run, tmp_pat
 def test_what_is_refused_makes_no_database(run: Run, unit: Path, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
     document = json.loads(run("export"))
-    document["records"] = [one for one in document["records"] if one["kind"] == "instance"]
+    document["records"] = [record for record in document["records"] if record["kind"] == "instance"]
     bad = {
         "damaged.json": '{"format": "ejector-twin-assets/1"}',
         "no_type.json": json.dumps(document),

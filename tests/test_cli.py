@@ -198,9 +198,9 @@ def test_a_replay_prints_and_counts_what_happened(
     first = [(e.time_ns, e.kind, e.severity, e.text, dict(e.data)) for e in stored]
     of_alarms = (Kind.ALARM, Kind.ALARM_CHANGED)  # these follow the block they were found in
     for alarms in (False, True):
-        chosen = [one for one in first if (one[1] in of_alarms) is alarms]
+        chosen = [line for line in first if (line[1] in of_alarms) is alarms]
         assert chosen
-        assert [one for one in again if (one[1] in of_alarms) is alarms] == chosen
+        assert [line for line in again if (line[1] in of_alarms) is alarms] == chosen
     assert len(said.out.splitlines()) == len(stored)
 
 
@@ -338,7 +338,7 @@ def test_who_reads_what_it_says_may_go_and_it_goes_on(plc: PlcProcess, tmp_path:
         assert process.stdout.readline()
         process.stdout.close()
         until_logged(log, process, 12)
-        cycles = [one for one in open_log(log).events() if one.kind is Kind.CYCLE]
+        cycles = [event for event in open_log(log).events() if event.kind is Kind.CYCLE]
         until(lambda: len(list(open_log(log).events())) > len(cycles) + 2, process)
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 130
@@ -390,7 +390,7 @@ def test_a_file_that_may_grow_no_more_is_followed_by_another(
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 130
     assert (np.diff(rows_in(log)["sequence"]) == 1).all()
-    told = [one.kind for one in open_log(log).events()]
+    told = [event.kind for event in open_log(log).events()]
     assert Kind.OUTPUT_DOWN in told
     assert Kind.OUTPUT_BACK in told
 
@@ -452,7 +452,7 @@ def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
     assert twin(monkeypatch, *run_once, "--duration", "1") == 0
     (second,) = logs.glob("*.mcap")
     assert second != first
-    deleted = [one.text for one in open_log(second).events() if one.kind is Kind.LOG_DELETED]
+    deleted = [event.text for event in open_log(second).events() if event.kind is Kind.LOG_DELETED]
     assert len(deleted) == 1
     assert deleted[0].startswith(f"{first.name} is deleted")
     assert "log_deleted" in capsys.readouterr().out

@@ -135,10 +135,10 @@ def test_paths_and_questions_in_words() -> None:
 
 def test_kinds_of_tables_are_found_at_their_places() -> None:
     data = sections()["data"][""]
-    names = {one.__name__ for one in models_at(data, ("system", "parts", 3))}
+    names = {model.__name__ for model in models_at(data, ("system", "parts", 3))}
     assert names == {"Tube", "Tee", "Filter", "Sensor", "Vessel", "Cups"}
     columns = sections()["import"][""]
-    assert [one.__name__ for one in models_at(columns, ("columns", "x"))] == ["ColumnSource"]
+    assert [model.__name__ for model in models_at(columns, ("columns", "x"))] == ["ColumnSource"]
 
 
 def test_comments_beside_and_above_a_key_are_read() -> None:

@@ -96,7 +96,7 @@ def _options(command: str) -> set[str]:
 def _commands() -> Iterator[str]:
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         below = getattr(command, "commands", None)
-        yield from (f"{name} {one}" for one in below) if below else (name,)
+        yield from (f"{name} {command}" for command in below) if below else (name,)
 
 
 EITHER = {USAGE, SOURCE}
@@ -221,7 +221,7 @@ def test_a_mistake_is_said_and_ends_as_the_contract_has_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     there = {path.name for path in here.iterdir()}
-    given = [{"C": CONFIG, "L": str(log)}.get(one, one) for one in arguments]
+    given = [{"C": CONFIG, "L": str(log)}.get(argument, argument) for argument in arguments]
     assert twin(monkeypatch, *command.split(), *given) in codes
     heard = capsys.readouterr()
     assert "Traceback" not in heard.err

@@ -65,7 +65,7 @@ def test_a_cache_that_others_may_write_to_is_not_unpickled(tmp_path: Path) -> No
 def test_what_is_compiled_is_for_its_user_alone(tmp_path: Path) -> None:
     start(tmp_path)
     folders = [tmp_path / "ejector-twin", *(tmp_path / "ejector-twin").iterdir()]
-    assert [one.stat().st_mode & 0o777 for one in folders] == [0o700, 0o700]
+    assert [folder.stat().st_mode & 0o777 for folder in folders] == [0o700, 0o700]
 
 
 def test_a_folder_of_somebody_else_is_refused(

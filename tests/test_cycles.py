@@ -49,7 +49,7 @@ def cycles(samples: Samples, ticks: Ticks, cuts: Sequence[int] = ()) -> list[Cyc
 
 
 def lengths(found: list[Cycle]) -> list[tuple[int, int, bool]]:
-    return [(one.index, len(one.samples), one.complete) for one in found]
+    return [(cycle.index, len(cycle.samples), cycle.complete) for cycle in found]
 
 
 # Cutting.
@@ -97,8 +97,8 @@ def test_a_long_cycle_comes_in_pieces() -> None:
 def test_a_record_is_judged_in_whole_cycles_however_long_a_part_is_held() -> None:
     held = [(SUCTION, 1000), (HOLD, 3 * LONGEST_PIECE), (BLOW_OFF, 20), (IDLE, 40)]
     found = whole([rows((IDLE, 5), *held, *held, *held, (SUCTION, 9))])
-    assert [(one.index, len(one.samples)) for one in found] == [(n, 31_060) for n in range(3)]
-    assert [one.settled for one in found] == [False, True, True]
+    assert [(cycle.index, len(cycle.samples)) for cycle in found] == [(n, 31_060) for n in range(3)]
+    assert [cycle.settled for cycle in found] == [False, True, True]
 
 
 def test_rows_of_an_unfinished_piece_are_given_when_a_batch_is_new() -> None:
@@ -133,16 +133,16 @@ def test_every_row_is_in_one_cycle_however_it_comes(
     whole, parts = cycles(samples, ticks), cycles(samples, ticks, sorted(cuts))
     assert lengths(whole) == lengths(parts)
     for found in (whole, parts):
-        assert np.concatenate([one.samples for one in found]).tobytes() == samples.tobytes()
-        assert np.concatenate([one.ticks for one in found]).tobytes() == ticks.tobytes()
+        assert np.concatenate([cycle.samples for cycle in found]).tobytes() == samples.tobytes()
+        assert np.concatenate([cycle.ticks for cycle in found]).tobytes() == ticks.tobytes()
 
 
 @pytest.mark.parametrize(("name", "period_s"), [("test_rig", 3.2), ("gripper", 2.0)])
 def test_the_simulated_rig_gives_its_cycles(name: str, period_s: float) -> None:
     samples, ticks = rigs.expectation(rigs.twin(name), [rigs.recorded(name, 20.0)[0]])
-    found = [one for one in cycles(samples, ticks) if one.complete]
+    found = [cycle for cycle in cycles(samples, ticks) if cycle.complete]
     assert abs(len(found) - int(19.5 / period_s)) <= 1  # the program jitters
-    assert [one.index for one in found] == list(range(len(found)))
+    assert [cycle.index for cycle in found] == list(range(len(found)))
 
 
 # Figures.
@@ -239,12 +239,12 @@ def test_the_levels_of_the_air_saving_are_its_knees() -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_healthy_cycle_of_the_rig(name: str) -> None:
     samples, ticks = rigs.expectation(rigs.twin(name), [rigs.recorded(name, 20.0)[0]])
-    found = [figures(one, rigs.theta(name)) for one in cycles(samples, ticks) if one.complete]
-    for one in found[1:]:
-        assert one["t0_measured"] == pytest.approx(one["t0_expected"], rel=0.03)
-        assert one["h1_level"] == pytest.approx(750, abs=10)
-        assert one["max_vacuum"] == pytest.approx(750, abs=15)
-        assert one["suction_rms"] < 8
+    found = [figures(cycle, rigs.theta(name)) for cycle in cycles(samples, ticks) if cycle.complete]
+    for cycle in found[1:]:
+        assert cycle["t0_measured"] == pytest.approx(cycle["t0_expected"], rel=0.03)
+        assert cycle["h1_level"] == pytest.approx(750, abs=10)
+        assert cycle["max_vacuum"] == pytest.approx(750, abs=15)
+        assert cycle["suction_rms"] < 8
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.sampled_from([0.0, 0.3, 1.0]))

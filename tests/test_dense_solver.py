@@ -101,7 +101,7 @@ def test_strides_do_not_see_where_blocks_end(seed: int, cuts: set[int]) -> None:
     driven = stream(theta, seed)
     whole = read(DenseSolver(), theta, driven)
     pieces = read(DenseSolver(), theta, driven, sorted(cuts))
-    assert [one.tobytes() for one in whole] == [one.tobytes() for one in pieces]
+    assert [array.tobytes() for array in whole] == [array.tobytes() for array in pieces]
 
 
 def free(theta: Theta, commands: Signals, cuts: Sequence[int] = ()) -> tuple[Signals, Rows]:
@@ -141,7 +141,7 @@ def test_a_step_reaches_over_many_rows_where_little_happens() -> None:
     driven = np.full(800, MS), phase_rows([(SUCTION, 800)]), np.full(800, np.nan)
     begun = []
     for row in range(800):
-        read(model, theta, tuple(one[row : row + 1] for one in driven))  # type: ignore[arg-type]
+        read(model, theta, tuple(array[row : row + 1] for array in driven))  # type: ignore[arg-type]
         begun.append(model.begin.tobytes())
     assert len(set(begun[200:])) < 250
 
@@ -162,9 +162,9 @@ def test_a_signal_outlives_a_step_that_is_done_anew() -> None:
     theta[c.H2_LOW], theta[c.H2] = 1 * MBAR, 900 * MBAR
     model = DenseSolver.at_rest(theta)
     driven = np.full(400, MS), phase_rows([(SUCTION, 399), (HOLD, 1)]), np.full(400, np.nan)
-    read(model, theta, tuple(one[:399] for one in driven))  # type: ignore[arg-type]
+    read(model, theta, tuple(array[:399] for array in driven))  # type: ignore[arg-type]
     model.now[kernel.SIGNALS] = Signal.PART_PRESENT
-    _, signals = read(model, theta, tuple(one[399:] for one in driven))  # type: ignore[arg-type]
+    _, signals = read(model, theta, tuple(array[399:] for array in driven))  # type: ignore[arg-type]
     assert signals.tolist() == [Signal.PART_PRESENT]
 
 

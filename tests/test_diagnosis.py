@@ -132,7 +132,7 @@ def test_a_healthy_record_of_a_coarse_input_with_hum_is_consistent(
 def confirmed(diagnosis: Diagnosis, *causes: Cause) -> Hypothesis:
     """What is left of causes, once they were fitted and asked for a gain on unseen cycles."""
     evidence, held_out = diagnosis.evidence, diagnosis.held_out
-    cycles = [one for one in evidence.judged if one not in held_out]
+    cycles = [cycle for cycle in evidence.judged if cycle not in held_out]
     left = _confirmed(evidence, cycles, _about(evidence, cycles, causes))
     return () if left is None else left.hypothesis
 
@@ -142,10 +142,10 @@ def test_a_cause_without_a_gain_on_unseen_cycles_is_none() -> None:
     leak = with_leak()
     (true,) = leak.hypothesis
     chance = Cause("suction_loss", {"loss": 1.0}, Course.RAMP)
-    assert [one.effect for one in confirmed(leak, true, chance)] == ["leakage"]
-    assert [one.effect for one in confirmed(leak, true)] == ["leakage"]
+    assert [cause.effect for cause in confirmed(leak, true, chance)] == ["leakage"]
+    assert [cause.effect for cause in confirmed(leak, true)] == ["leakage"]
     healthy = of(record(27.0, seed=24))
-    some = frozenset(int(one) for one in healthy.evidence.numbers[1:5])
+    some = frozenset(int(number) for number in healthy.evidence.numbers[1:5])
     for spurious in (chance, replace(chance, course=Course.INTERMITTENT, cycles=some)):
         assert confirmed(healthy, spurious) == ()
 
@@ -210,7 +210,9 @@ def test_fewer_than_five_unseen_cycles_give_a_gain_no_interval(cycles: int) -> N
     leak = with_leak()
     assert leak.before
     assert leak.after
-    two = (replace(one, squares=one.squares[-cycles:]) for one in (leak.before, leak.after))
+    two = (
+        replace(judged, squares=judged.squares[-cycles:]) for judged in (leak.before, leak.after)
+    )
     few = gain(*two)
     assert (few["low95"], few["high95"]) == (None, None)
     assert few["rms_reduction_pct"] == pytest.approx(leak.json["gain"]["rms_reduction_pct"], abs=9)
@@ -220,7 +222,10 @@ def test_the_interval_of_a_gain_has_a_width_or_there_is_none() -> None:
     leak = with_leak()
     assert leak.before
     assert leak.after
-    many = (replace(one, squares=np.resize(one.squares, 6)) for one in (leak.before, leak.after))
+    many = (
+        replace(judged, squares=np.resize(judged.squares, 6))
+        for judged in (leak.before, leak.after)
+    )
     known = gain(*many)
     assert known["low95"] is not None
     assert known["high95"] is not None
@@ -252,7 +257,7 @@ def test_a_hysteresis_that_nobody_knows_is_no_drift_where_a_leak_shows_it(
     leaks = blocks(GRIPPER_PLC, 36.0, [parse_fault("leakage=1.5")], seed=3)
     answer = of(leaks, replace(GRIPPER, data=data, monitor=monitor)).json
     drifts = ["threshold_drift"] if known_mbar < 10.0 else []
-    assert [one["effect"] for one in answer["causes"]] == ["leakage", *drifts]
+    assert [cause["effect"] for cause in answer["causes"]] == ["leakage", *drifts]
 
 
 def test_a_leak_that_opens_half_way_is_a_step_with_its_onset() -> None:
@@ -341,7 +346,7 @@ def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
 
     def worse(*known: Any, **least: Any) -> Unlisted:
         found = look(*known, **least)
-        upside_down = ({"mbar": tuple(-mbar for mbar in one.mbar)} for one in found.terms)
+        upside_down = ({"mbar": tuple(-mbar for mbar in term.mbar)} for term in found.terms)
         terms = zip(found.terms, upside_down, strict=True)
         return replace(found, terms=tuple(one.model_copy(update=mbar) for one, mbar in terms))
 
@@ -609,7 +614,7 @@ def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:
     part = thinned(whole, whole.judged, 6)
     assert len(part.judged) == 6
     assert list(part.numbers[part.judged]) == sorted({*part.numbers[part.judged]})
-    off = [one.off([HEALTHY])[:, 0] for one in (whole, part)]
+    off = [log.off([HEALTHY])[:, 0] for log in (whole, part)]
     for position in part.judged[1::2]:  # the second of each pair: the model has swung in
         number = part.numbers[position]
         here = off[1][part.bins.cycle == position]
@@ -632,8 +637,8 @@ def test_cycles_that_only_lead_to_others_do_not_come_and_go_alone() -> None:
     judged = {int(number) for number in part.numbers[part.judged]}
     first, *others = tried_in_or_out(part)
     assert first == {int(part.numbers[0])}
-    assert [max(one) for one in others] == sorted(judged)
-    assert [sorted(one) for one in others if len(one) > 1] == [
+    assert [max(group) for group in others] == sorted(judged)
+    assert [sorted(group) for group in others if len(group) > 1] == [
         [number - 1, number] for number in sorted(judged)[2::2]
     ]
     assert first.union(*others) == set(part.numbers.tolist())
@@ -645,7 +650,9 @@ def test_cycles_that_only_lead_to_others_change_no_price() -> None:
     part = thinned(whole, whole.judged, 6)
     judged = [int(number) for number in part.numbers[part.judged]]
     some = Cause("leakage", {}, Course.INTERMITTENT, cycles=frozenset(judged[4:]))
-    led = replace(some, cycles=frozenset(int(one) for one in part.numbers if one >= judged[4] - 1))
+    led = replace(
+        some, cycles=frozenset(int(number) for number in part.numbers if number >= judged[4] - 1)
+    )
     assert len(led.cycles) > len(some.cycles)
     assert price(part, (led,)) == price(part, (some,))
     every = replace(some, cycles=frozenset(judged))

@@ -53,7 +53,7 @@ def told(
         if begun := cutter.begun():
             key.run_ahead(*begun)  # as the monitor does
     found += [key.take(piece) for piece in cutter.flush()]
-    return [one for one in found if one is not None]
+    return [cycle for cycle in found if cycle is not None]
 
 
 @cache
@@ -63,11 +63,11 @@ def healthy(name: str) -> list[CycleFigures]:
 
 def whole(cycles: Iterable[CycleFigures]) -> list[CycleFigures]:
     """Those beside which the model had swung in, and whose end was seen."""
-    return [one for one in list(cycles)[1:] if math.isfinite(one.measured["nozzle_share"])]
+    return [cycle for cycle in list(cycles)[1:] if math.isfinite(cycle.measured["nozzle_share"])]
 
 
 def mean(found: Iterable[CycleFigures], figure: str, side: str = "measured") -> float:
-    values = [getattr(one, side)[figure] for one in found]
+    values = [getattr(cycle, side)[figure] for cycle in found]
     return float(np.mean(values))
 
 
@@ -98,7 +98,7 @@ def test_a_healthy_rig_is_as_expected(name: str) -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_t0_is_expected_as_the_twin_beside_the_cycle_has_it(name: str) -> None:
     samples, ticks = seen(name)
-    pieces = [one for one in CycleCutter().push(samples, ticks) if one.index >= 0]
+    pieces = [piece for piece in CycleCutter().push(samples, ticks) if piece.index >= 0]
     for piece, cycle in list(zip(pieces, healthy(name), strict=False))[1:]:
         beside = old_figures(piece, rigs.theta(name))["t0_expected"]
         assert cycle.expected["t0"] == pytest.approx(beside, abs=1.5)
@@ -133,7 +133,7 @@ def test_what_is_known_of_a_leak_is_expected_too(name: str) -> None:
 
 def test_more_than_the_permitted_leakage_is_warned_of() -> None:
     cycles = told(*seen("gripper", "leakage=2.0"), rigs.config("gripper").data)
-    assert {one.warnings for one in cycles} == {("t1_over_limit", "leakage_over_limit")}
+    assert {cycle.warnings for cycle in cycles} == {("t1_over_limit", "leakage_over_limit")}
     assert "leakage over limit (" in cycles[3].words
     own = FigureSettings(permitted_leakage_mbar_s=500.0, permitted_t1_ms=300.0)
     assert told(*seen("gripper", "leakage=2.0"), rigs.config("gripper").data, own)[1].warnings == (
@@ -159,7 +159,7 @@ def test_a_threshold_of_the_unseen_control_moves_t1_and_not_t0() -> None:
     # Cycles that end earlier leave the gas of the next one another warmth, about 1.5 % of t0.
     assert mean(moved, "t0") == pytest.approx(mean(moved, "t0", "expected"), rel=0.03)
     assert mean(moved, "t1") < 0.75 * mean(moved, "t1", "expected")
-    assert {one.measured["h1_not_reached"] for one in moved} == {0.0}  # it was, where it is now
+    assert {cycle.measured["h1_not_reached"] for cycle in moved} == {0.0}  # it was, where it is now
 
 
 def test_air_saving_that_is_off_is_judged_by_the_sensor() -> None:
@@ -178,7 +178,7 @@ def test_an_open_cup_gives_the_free_flow_vacuum_beside_that_of_the_model() -> No
     """The rig's cup opens by 600 sl/min at sonic flow: about 5 mbar, and what the hose takes."""
     data = rigs.config("gripper").data
     samples, ticks = seen("gripper")
-    pieces = [one for one in CycleCutter().push(samples, ticks) if one.complete]
+    pieces = [piece for piece in CycleCutter().push(samples, ticks) if piece.complete]
     still = Expectation(data).free_flow
     assert 50 < still < 400  # 2 m of 4 mm hose
     piece = pieces[2]
@@ -186,7 +186,7 @@ def test_an_open_cup_gives_the_free_flow_vacuum_beside_that_of_the_model() -> No
     piece.samples["pressure"][rows] = (data.ambient.pressure_mbar - 1.3 * still) * MBAR
     piece.ticks["phase"][rows] = Phase.SUCTION
     key = KeyFigures(data)
-    cycle = [key.take(one) for one in pieces[:3]][2]
+    cycle = [key.take(piece) for piece in pieces[:3]][2]
     assert cycle is not None
     assert cycle.measured["free_flow"] == pytest.approx(1.3 * still, rel=1e-4)
     assert cycle.expected["free_flow"] == still
@@ -205,14 +205,14 @@ def test_a_cycle_that_does_not_come_to_h2_says_so() -> None:
     """The vacuum still rises when suction ends: no open cup."""
     data = rigs.config("gripper").data
     samples, ticks = seen("gripper")
-    pieces = [one for one in CycleCutter().push(samples, ticks) if one.complete]
+    pieces = [piece for piece in CycleCutter().push(samples, ticks) if piece.complete]
     piece = pieces[2]
     rows = np.flatnonzero(np.isin(piece.ticks["phase"], (Phase.SUCTION, Phase.HOLD)))
     vacuum = np.linspace(0.0, 300.0, len(rows))  # mbar
     piece.samples["pressure"][rows] = (data.ambient.pressure_mbar - vacuum) * MBAR
     piece.ticks["phase"][rows] = Phase.SUCTION
     key = KeyFigures(data)
-    cycle = [key.take(one) for one in pieces[:3]][2]
+    cycle = [key.take(piece) for piece in pieces[:3]][2]
     assert cycle is not None
     assert re.fullmatch(
         r"cycle \d+: H2 not reached \(expected in \d+ ms\); H1 not reached \(highest 300 mbar\)",
@@ -241,7 +241,7 @@ def test_the_figures_do_not_depend_on_the_blocks() -> None:
     data = rigs.config("test_rig").data
     at_once = told(samples, ticks, data)
     parts = told(samples, ticks, data, cuts=range(30, 20000, 30))
-    assert [one.plain() for one in at_once] == [one.plain() for one in parts]
+    assert [cycle.plain() for cycle in at_once] == [cycle.plain() for cycle in parts]
 
 
 def test_before_it_has_swung_in_the_model_expects_nothing() -> None:
@@ -265,7 +265,7 @@ def test_a_long_cycle_is_told_whole() -> None:
     """Suction of 13 s comes in two pieces; the figures are those of both."""
     samples, ticks = program(13_000, 600, 45.0, "leakage=1")
     cycles = told(samples, ticks, rigs.config("test_rig").data)
-    assert [one.cycle for one in cycles] == [0, 1, 2, 3]
+    assert [cycle.cycle for cycle in cycles] == [0, 1, 2, 3]
     for cycle in cycles[1:3]:
         assert cycle.end_ns - cycle.begin_ns > 13e9
         assert cycle.measured["switchings"] >= 2
@@ -278,7 +278,7 @@ def test_a_long_idle_is_not_waited_for_and_is_known_to_the_model() -> None:
     samples, ticks = program(2300, 13_000, 50.0, "leakage=1")
     key, cutter = KeyFigures(rigs.config("test_rig").data), CycleCutter()
     found = [key.take(piece) for piece in cutter.push(samples, ticks)]
-    assert [one.cycle if one else None for one in found[:6]] == [None, 0, None, 1, None, 2]
+    assert [cycle.cycle if cycle else None for cycle in found[:6]] == [None, 0, None, 1, None, 2]
     last = found[5]
     assert last is not None
     assert last.end_ns - last.begin_ns < 1.1e10
@@ -334,7 +334,7 @@ def test_a_break_leaves_what_was_known_before_it(flag: Quality) -> None:
     assert cut.measured["t0"] == pytest.approx(healthy("test_rig")[0].measured["t0"])
     for name in ("t1", "leakage", "max_vacuum", "air", "h1_not_reached"):
         assert math.isnan(cut.measured[name]), name
-    assert [one.cycle for one in cycles] == list(range(len(healthy("test_rig"))))
+    assert [cycle.cycle for cycle in cycles] == list(range(len(healthy("test_rig"))))
     for one, usual in zip(cycles[1:], healthy("test_rig")[1:], strict=True):
         assert one.measured == pytest.approx(usual.measured, nan_ok=True)
     assert math.isnan(cycles[1].expected["t0"])  # what the gas was before is not known
@@ -414,7 +414,7 @@ def events(name: str, teller: KeyFigures | None, rows: Samples | None = None) ->
 def test_the_loops_cycles_carry_the_key_figures() -> None:
     data = rigs.config("gripper").data
     with_key, without = events("gripper", KeyFigures(data)), events("gripper", None)
-    direct = [one.plain() for one in healthy("gripper")]
+    direct = [cycle.plain() for cycle in healthy("gripper")]
     for event, plain in zip(with_key, direct, strict=True):
         assert event.data.items() >= plain.items()
         assert json.loads(json.dumps(dict(event.data), allow_nan=False)) == event.data

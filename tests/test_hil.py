@@ -136,11 +136,11 @@ def test_the_newest_of_each_block_is_handed_out_before_the_block_goes_on() -> No
     rows = np.concatenate([block for block in stream if len(block) or not written])
     expected, _ = free("test_rig", samples)
     assert rows["pressure"].tobytes() == expected.astype(np.float32).tobytes()
-    assert [one[0] for one in written] == expected[49::50].tolist()
+    assert [outputs[0] for outputs in written] == expected[49::50].tolist()
     assert set(np.flatnonzero(rows["quality"])) == {300}
     assert rows["quality"][300] == Quality.GAP
     assert (rows["commands"] == samples["commands"]).all()
-    assert any(one[1] for one in written)
+    assert any(outputs[1] for outputs in written)
     assert closed == [True]
 
 
@@ -368,7 +368,7 @@ def test_the_program_waits_for_the_part() -> None:
     waiting = fed(task, 1200)
     assert (waiting[100:] == Command.SUCTION).all()
     going_on = fed(task, 330, part_present=1)
-    assert [int(one) for one in going_on[[0, 199, 201, 249, 251, 329]]] == [1, 1, 2, 2, 0, 0]
+    assert [int(value) for value in going_on[[0, 199, 201, 249, 251, 329]]] == [1, 1, 2, 2, 0, 0]
 
 
 def test_a_part_that_does_not_come_is_given_up() -> None:
@@ -430,13 +430,13 @@ class Tap:
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        for one in self._sockets:
+        for connection in self._sockets:
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
             thread.join()
-        for one in self._sockets:
-            one.close()
+        for connection in self._sockets:
+            connection.close()
 
 
 def modbus_requests(sent: bytearray) -> list[tuple[int, int]]:
@@ -521,7 +521,7 @@ def test_beside_a_plc_only_reading_function_codes_are_sent(
         address = ("--address", f"127.0.0.1:{tap.port}")
         assert twin(monkeypatch, "run", config, *address, "--duration", "1.5") == 0
         assert twin(monkeypatch, "probe", config, *address) in (0, 3)
-    requests = [one for sent in tap.sent for one in modbus_requests(sent)]
+    requests = [request for sent in tap.sent for request in modbus_requests(sent)]
     assert len(requests) > 100
     assert {function for function, _ in requests} <= {1, 2, 3, 4}
 
@@ -538,11 +538,11 @@ def test_beside_an_opcua_server_no_write_is_sent(
         )
         command = ("run", config, "--address", f"127.0.0.1:{tap.port}", "--duration")
         assert twin(monkeypatch, *command, "2") == 0
-        services = [one for sent in tap.sent for one in opcua_services(sent)]
+        services = [service for sent in tap.sent for service in opcua_services(sent)]
         assert services.count(asked) > 20
         assert WRITE_REQUEST not in services
         assert twin(monkeypatch, *command, "2", "--hil") == 0  # that the tap would have seen it
-        assert WRITE_REQUEST in [one for sent in tap.sent for one in opcua_services(sent)]
+        assert WRITE_REQUEST in [service for sent in tap.sent for service in opcua_services(sent)]
 
 
 def test_in_the_loop_only_what_is_listed_is_written(
@@ -559,7 +559,7 @@ def test_in_the_loop_only_what_is_listed_is_written(
     assert {code for code, _ in modbus_requests(first)} == {3}  # it only asks whether it answers
     (shared,) = rest  # reading and writing share the connection
     requests = set(modbus_requests(shared))
-    assert {one for one in requests if one[0] > 4} == {(16, 200), (16, 204)}
+    assert {request for request in requests if request[0] > 4} == {(16, 200), (16, 204)}
     assert 3 in {code for code, _ in requests}
 
 
@@ -710,8 +710,8 @@ def test_the_log_of_a_loop_replays(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert twin(monkeypatch, *command, "--log", log, "--duration", "6") == 0
     assert twin(monkeypatch, "replay", log, "-o", tmp_path / "b.mcap") == 0
     first, again = (
-        [rows.tobytes() for pair in open_log(tmp_path / one).blocks() for rows in pair]
-        for one in ("a.mcap", "b.mcap")
+        [rows.tobytes() for pair in open_log(tmp_path / name).blocks() for rows in pair]
+        for name in ("a.mcap", "b.mcap")
     )
     assert first == again
     rows = np.concatenate([samples for samples, _ in open_log(log).blocks()])

@@ -96,11 +96,11 @@ def test_the_tags_that_few_have_stand_there_ready_to_be_taken_in(
 def test_so_do_the_columns_of_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     assert twin(monkeypatch, "init", "--address", "none") == 0
     text = Path("cell.toml").read_text()
-    offered = [one for one in Column if f'# {one} = "' in text]
+    offered = [column for column in Column if f'# {column} = "' in text]
     beside = {*BESIDE, *REPORTED} - {Column.SUPPLY_BAR}
     assert beside < set(offered)
-    for one in offered:
-        text = text.replace(f"# {one} = ", f"{one} = ")
+    for column in offered:
+        text = text.replace(f"# {column} = ", f"{column} = ")
     assert set(Document.parse(text, "x").section(ImportSettings, "import").columns) == set(offered)
 
 

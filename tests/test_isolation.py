@@ -89,13 +89,13 @@ def test_healthy_cycles_are_probably_nothing(name: str, seed: int) -> None:
     told = events(name, [], 60, seed)
     assert raised(told) == []
     assert len(probabilities(told)) > 40
-    assert min(one["none"] for one in probabilities(told).values()) > 0.5
+    assert min(chance["none"] for chance in probabilities(told).values()) > 0.5
 
 
 def test_probabilities_are_of_one_cause_or_none() -> None:
-    for one in probabilities(events("test_rig", [f"leakage=0.25@c{BEGINS}"])).values():
-        assert sum(one.values()) == pytest.approx(1.0, abs=0.05)
-        assert set(one) <= {"none", UNKNOWN, *(suspect.effect for suspect in SUSPECTS)}
+    for chances in probabilities(events("test_rig", [f"leakage=0.25@c{BEGINS}"])).values():
+        assert sum(chances.values()) == pytest.approx(1.0, abs=0.05)
+        assert set(chances) <= {"none", UNKNOWN, *(suspect.effect for suspect in SUSPECTS)}
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
@@ -192,16 +192,18 @@ def test_only_what_is_fit_to_be_judged_says_something() -> None:
     samples, _ = rigs.recorded("gripper", 12.0)
     cycles = list(cut([rigs.expectation(rigs.twin("gripper"), [samples])]))
     theta = rigs.theta("gripper")
-    looks = [CycleView(one, None, figures(one, theta), fit=one.index != 2) for one in cycles]
+    looks = [
+        CycleView(cycle, None, figures(cycle, theta), fit=cycle.index != 2) for cycle in cycles
+    ]
     isolation = rigs.isolating("gripper").isolation
     assert isolation
     heard = isolation.hear(looks)
     saying = {one.index: said for one, said in zip(cycles, heard, strict=True) if said}
-    assert list(saying) == [one.index for one in cycles if one.complete and one.index != 2]
-    for one in cycles:
-        if one.index in saying:
-            lasted = np.ptp(one.samples["time_ns"]) * 1e-9
-            assert saying[one.index].seconds == pytest.approx(lasted)
+    assert list(saying) == [cycle.index for cycle in cycles if cycle.complete and cycle.index != 2]
+    for cycle in cycles:
+        if cycle.index in saying:
+            lasted = np.ptp(cycle.samples["time_ns"]) * 1e-9
+            assert saying[cycle.index].seconds == pytest.approx(lasted)
 
 
 def test_what_is_far_out_is_not_learned_as_usual() -> None:
@@ -236,8 +238,8 @@ def test_without_anything_known_of_healthy_cycles_sums_alarm_still() -> None:
 def test_sizes_are_possible_ones() -> None:
     told = events("test_rig", [f"supply_pressure_drop=3@c{BEGINS}"])
     for event in named(told):
-        ends = [one.parameter for one in SUSPECTS if one.effect == event.data["effect"]]
-        assert any(one.low < event.data.get("size", one.typical) < one.high for one in ends)
+        ends = [suspect.parameter for suspect in SUSPECTS if suspect.effect == event.data["effect"]]
+        assert any(end.low < event.data.get("size", end.typical) < end.high for end in ends)
 
 
 def test_the_bank_expects_what_the_twin_expects_where_it_is_drawn() -> None:
@@ -332,5 +334,5 @@ def test_where_it_is_known_that_something_differs_the_causes_share_all_of_it() -
     leak, other = Likeness("leakage", 1.0, "sl/min", 0.03), Likeness(UNKNOWN, None, "", 0.01)
     found = Verdict(0.96, [leak, other]).where_changed()
     assert found.none == 0.0
-    assert [one.share for one in found.causes] == pytest.approx([0.75, 0.25])
+    assert [cause.share for cause in found.causes] == pytest.approx([0.75, 0.25])
     assert Verdict(1.0, ()).where_changed().causes == []

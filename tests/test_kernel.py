@@ -297,10 +297,10 @@ def test_each_of_many_may_have_phases_of_its_own() -> None:
     dt, expected = np.full(800, MS), np.empty((800, 2))
     both = np.stack([theta, theta], axis=1)
     kernel.advance(kernel.new_state(2), both, dt, phase, level, expected)
-    for one in range(2):
+    for column in range(2):
         alone = np.empty(800)
-        kernel.advance(kernel.new_state(), theta, dt, phase[:, one].copy(), level, alone)
-        assert expected[:, one] == pytest.approx(alone, abs=0.5)
+        kernel.advance(kernel.new_state(), theta, dt, phase[:, column].copy(), level, alone)
+        assert expected[:, column] == pytest.approx(alone, abs=0.5)
     assert expected[-1, 1] > expected[-1, 0] + 10 * MBAR
 
 

@@ -183,7 +183,9 @@ def test_what_nobody_listed_becomes_a_nozzle_that_gives_less_the_longer_it_runs(
     assert "suction capacity changes by loss" in mechanism["formula"]
     known = mechanism["parameters"]
     assert set(known) >= {"loss", "sets_in"}
-    assert all(one["low95"] <= one["value"] <= one["high95"] for one in known.values())
+    assert all(
+        interval["low95"] <= interval["value"] <= interval["high95"] for interval in known.values()
+    )
     assert answer["extended"]["rms_mbar"] < 0.25 * answer["baseline"]["rms_mbar"]
     assert mechanism["sentence"][1:] in lines(answer, 0)
     assert mechanism["not_separable_from"]

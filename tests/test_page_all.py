@@ -103,7 +103,7 @@ class Told:
 
     def lines(self) -> dict[str, dict[str, Any]]:
         told = self.hall.look(lambda heard, why, since: overview(heard, why, since, self.now))
-        return {one["name"]: one for one in told["ejectors"]}
+        return {ejector["name"]: ejector for ejector in told["ejectors"]}
 
     def one(self, name: str) -> dict[str, Any]:
         found: dict[str, Any] = self.hall.look(
@@ -296,7 +296,7 @@ def client(
     folder: Path, hall: PlantOverview | None, *configs: Path, **access: Any
 ) -> Iterator[TestClient]:
     users = quick_users(folder / "users.toml")
-    ejectors = [Ejector(config(one)) for one in configs]
+    ejectors = [Ejector(config(path)) for path in configs]
     page = Page(ejectors, authenticator_of(users), Sessions(users), Access(**access), hall)
     with TestClient(page.app(), OURS, follow_redirects=False) as made:
         yield made
@@ -351,7 +351,7 @@ def publishers(running: Broker, count: int, closing: ExitStack) -> list[Mqtt]:
         closing.callback(ours.hang_up)
         ours.open()
         at = time.time()
-        ours.send([cycle(unit, one, at - 60 + one) for one in range(20)], "cycle")
+        ours.send([cycle(unit, number, at - 60 + number) for number in range(20)], "cycle")
         ours.send([values(unit, at, 40, 700.0 + number)], "values")
         made.append(ours)
     return made
@@ -402,7 +402,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         expect(page.locator("#banner")).to_contain_text("What follows is as it was then")
         expect(page.locator("#counts")).to_have_text("40 not known")
         assert said == []
-        assert [one for one in asked if not one.startswith(url)] == []
+        assert [address for address in asked if not address.startswith(url)] == []
 
 
 @pytest.mark.needs("axe", "mosquitto")
@@ -450,7 +450,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
             page.goto(url)
             expect(page.locator("#all-rows tr")).to_have_count(6)
             _is_fit(page)
-            heads = [one.is_visible() for one in page.get_by_text("Key figures (expected)").all()]
+            heads = [head.is_visible() for head in page.get_by_text("Key figures (expected)").all()]
             assert heads == ([False, *[True] * 6] if width < 600 else [True, *[False] * 6])
             page.locator("tr[data-name=cell-01] td").nth(1).click()
             expect(page.locator("#one-alarms article")).to_have_count(1)

@@ -106,7 +106,7 @@ class Server:
 @contextmanager
 def serving(configs: list[Path]) -> Iterator[tuple[str, Server]]:
     users, place = quick_users(configs[0].parent / "users.toml"), Place("127.0.0.1", 0)
-    ejectors = [Ejector(config(one)) for one in configs]
+    ejectors = [Ejector(config(path)) for path in configs]
     inner = make_server(
         Served(ejectors, authenticator_of(users), Sessions(users), Access()).app(), place
     )
@@ -132,7 +132,7 @@ def site(
     units = [f"gripper-0{number + 1}" for number in range(getattr(request, "param", 1))]
     paths = [write_config(tmp_path, unit) for unit in units]
     quick_users(tmp_path / "users.toml", ("ann", WORD, Role.CONFIGURE))
-    runs = [Run(config(one), time.time_ns) for one in paths]
+    runs = [Run(config(path), time.time_ns) for path in paths]
     with serving(paths) as (url, server):
         yield Site(url, browser, runs, server)
         for context in browser.contexts:
@@ -206,10 +206,10 @@ def test_it_opens_on_what_is_worst_and_lists_all_alarms_worst_first(site: Site) 
     page = site.open()
     cards = page.locator("#alarms article")
     expect(cards).to_have_count(3)
-    whose = [one.get_attribute("data-of") for one in cards.all()]
+    whose = [card.get_attribute("data-of") for card in cards.all()]
     assert whose == ["2", "1", "0"]  # high, medium, low priority
     lights = page.locator("#ejectors button")
-    assert [one.get_attribute("data-number") for one in lights.all()] == ["2", "1", "0"]
+    assert [light.get_attribute("data-number") for light in lights.all()] == ["2", "1", "0"]
     expect(lights.first).to_have_attribute("aria-pressed", "true")
     expect(page.locator("#measured")).to_have_text("300")
     expect(page).to_have_title("Alarm – gripper-03")
@@ -284,12 +284,12 @@ def test_a_german_browser_reads_german(site: Site) -> None:
     expect(card(page)).to_contain_text("erste Vermutung, oder poröse Leckage")
     expect(page.locator("#phase")).to_have_text("Saugen")
     card(page).locator("summary").click()
-    german = {form for one in catalogue("de") for form in forms(one.string)}
+    german = {form for message in catalogue("de") for form in forms(message.string)}
     english = {form for _, text in texts() for form in forms(text)} - german
     for tab in ("Trends", "Verlauf", "Grenzwerte", "Jetzt"):
         page.get_by_role("tab", name=tab).click()
         lines = page.locator("body").inner_text().splitlines()
-        assert {one for one in lines if one.strip() in english} <= {""}
+        assert {line for line in lines if line.strip() in english} <= {""}
         _is_fit(page)
     page.select_option("#language", "en")
     expect(page.get_by_role("tab", name="History")).to_be_visible()
@@ -599,7 +599,7 @@ def test_nothing_leaves_the_page_and_nothing_complains(site: Site) -> None:
         page.get_by_role("tab", name=tab).click()
     expect(page.locator("#measured")).to_have_text("600")
     assert len(asked) > 8
-    assert [one for one in asked if not one.startswith(site.url)] == []
+    assert [url for url in asked if not url.startswith(site.url)] == []
     assert said == []
 
 
@@ -805,9 +805,9 @@ def test_phases_and_lines_can_be_told_apart(site: Site, scheme: str) -> None:
     card_, *phases, blue, orange, ink, alarm = (page.evaluate("colour", name) for name in names)
     for phase in phases:
         assert _contrast(phase, ink) >= 4.5  # words
-        assert min(_contrast(phase, one) for one in (blue, orange, alarm)) >= 3.0  # lines
+        assert min(_contrast(phase, line) for line in (blue, orange, alarm)) >= 3.0  # lines
         assert _contrast(phase, card_) >= (1.6 if scheme == "dark" else 1.15)
-    assert len({one.lower() for one in phases}) == 3
+    assert len({colour.lower() for colour in phases}) == 3
 
 
 def _contrast(one: str, other: str) -> float:
@@ -817,9 +817,11 @@ def _contrast(one: str, other: str) -> float:
 
 def _luminance(colour: str) -> float:
     digits = colour.lstrip("#")
-    digits = digits if len(digits) == 6 else "".join(2 * one for one in digits)
+    digits = digits if len(digits) == 6 else "".join(2 * digit for digit in digits)
     parts = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
-    linear = [one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in parts]
+    linear = [
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    ]
     return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
 
 

@@ -176,7 +176,7 @@ def test_what_the_page_is_made_of_is_here(site: Site) -> None:
         assert answer.headers["content-type"].startswith(kind)
     first_view = [site.client.get("/"), *map(site.client.get, ("/api/me", "/api/all"))]
     files = [len(site.client.get(f"/static/{name}").content) for name in STATIC]
-    assert sum(files) + sum(len(one.content) for one in first_view) < 100_000
+    assert sum(files) + sum(len(answer.content) for answer in first_view) < 100_000
 
 
 @pytest.mark.parametrize(
@@ -299,7 +299,7 @@ def test_nobody_is_logged_in_from_another_page(site: Site, origin: str) -> None:
 
 def test_wrong_passwords_are_refused_and_then_slowed_down(site: Site) -> None:
     said = [site.log_in("ann", "wrong horse") for _ in range(6)]
-    assert [one.status_code for one in said] == [401] * 5 + [429]
+    assert [answer.status_code for answer in said] == [401] * 5 + [429]
     assert "Name or password is wrong." in said[0].text
     assert "Too many wrong passwords" in said[5].text
     assert site.log_in().status_code == 429  # also with the right one
@@ -392,8 +392,8 @@ def test_a_user_may_do_what_the_role_says(site: Site, role: Role, allowed: list[
         assert answer.status_code == (202 if deed in allowed else 403)
         if deed not in allowed:
             assert "it needs the role" in answer.json()["error"]
-    asked = [one for one in allowed if one not in ("commented", "limit_changed")]
-    assert sorted(one.deed.value for one in _asked(site)) == sorted(asked)
+    asked = [deed for deed in allowed if deed not in ("commented", "limit_changed")]
+    assert sorted(record.deed.value for record in _asked(site)) == sorted(asked)
 
 
 def test_a_user_with_a_name_of_any_letters_logs_in(site: Site) -> None:
@@ -415,12 +415,12 @@ def test_the_trail_says_who_did_what_from_where(site: Site, tmp_path: Path) -> N
     csrf = site.client.get("/api/me").json()["csrf"]
     site.client.post("/api/logout", headers={"origin": OURS, "x-csrf-token": csrf})
     told, _ = records(tmp_path)
-    assert {(one["who"], one["through"], one["from"]) for one in told} == {
+    assert {(record["who"], record["through"], record["from"]) for record in told} == {
         ("ann", "page", "testclient")
     }
     alarm = {"unit": "gripper-01", "alarm": LEAK}
     known = ("time", "who", "through", "from")
-    assert [{name: one[name] for name in one if name not in known} for one in told] == [
+    assert [{name: record[name] for name in record if name not in known} for record in told] == [
         {"what": "wrong_password"},
         {"what": "logged_in"},
         {"what": "acknowledged", **alarm},
@@ -552,7 +552,7 @@ def test_a_run_that_has_ended_is_said_and_its_alarms_stay(site: Site) -> None:
     state = site.ejector.state()
     assert (state["light"], state["running"], state["ended"]) == ("grey", False, True)
     assert state["last"] == NOW / 1e9
-    assert [one["alarm"] for one in state["alarms"]] == [LEAK]
+    assert [alarm["alarm"] for alarm in state["alarms"]] == [LEAK]
 
 
 def test_a_run_that_hangs_is_not_taken_for_one_that_is_well(site: Site) -> None:
@@ -715,7 +715,7 @@ def test_a_comment_stays_with_its_alarm_and_needs_no_run(site: Site, tmp_path: P
     said = [{"who": "ann", "when": "22:13:20, 0 s ago", "text": "new hose ordered"}]
     (alarm,), (episode,) = site.ejector.state()["alarms"], site.ejector.history(1.0)
     assert alarm["comments"] == episode["comments"] == said
-    (record,) = [one for one in records(tmp_path)[0] if one["what"] == "commented"]
+    (record,) = [entry for entry in records(tmp_path)[0] if entry["what"] == "commented"]
     assert (record["who"], record["alarm"]) == ("ann", LEAK)
 
 
@@ -807,8 +807,10 @@ def test_the_trail_says_who_asked_for_which_limit(site: Site, tmp_path: Path) ->
     site.log_in()
     _change(site)
     _change(site, CHANGE | {"value": None})
-    told = [one for one in records(tmp_path)[0] if one["what"] == "limit_changed"]
-    assert [(one["who"], one["limit"], one["value"], one["reason"]) for one in told] == [
+    told = [record for record in records(tmp_path)[0] if record["what"] == "limit_changed"]
+    assert [
+        (record["who"], record["limit"], record["value"], record["reason"]) for record in told
+    ] == [
         ("ann", "permitted_t1_ms", "700", "shorter cycle"),
         ("ann", "permitted_t1_ms", "configured", "shorter cycle"),
     ]

@@ -52,11 +52,11 @@ def asked(port: int) -> bytes:
 @pytest.mark.parametrize("said", [b"", GET], ids=["nothing", "half of a head"])
 def test_who_does_not_ask_is_let_go_and_others_find_room(port: int, said: bytes) -> None:
     idle = [come(port) for _ in range(8)]
-    for one in idle:
-        one.sendall(said)
-    for one in idle:
-        with one:
-            assert one.recv(1) == b""  # or it would wait for as long as PATIENCE_S
+    for connection in idle:
+        connection.sendall(said)
+    for connection in idle:
+        with connection:
+            assert connection.recv(1) == b""  # or it would wait for as long as PATIENCE_S
     assert asked(port).endswith(b"here")
 
 

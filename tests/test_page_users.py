@@ -45,8 +45,8 @@ def test_sessions_and_their_tokens_differ_and_do_not_pile_up(
     known = quick_users(tmp_path / "users.toml", ANN)
     sessions = Sessions(known)
     tokens = [sessions.begin("ann") for _ in range(5)]
-    there = [sessions.get(one) for one in tokens]
-    assert [one is None for one in there] == [True, True, False, False, False]
-    assert len({one.csrf for one in there if one}) == 3
+    there = [sessions.get(token) for token in tokens]
+    assert [session is None for session in there] == [True, True, False, False, False]
+    assert len({session.csrf for session in there if session}) == 3
     sessions.end(tokens[-1])
     assert sessions.get(tokens[-1]) is None

@@ -115,8 +115,8 @@ def test_the_newest_row_is_shown_with_its_time(results: Results) -> None:
     assert readings["Deviation"].value == pytest.approx(5.0)
     assert readings["Phase"].value == Phase.SUCTION
     values = [readings[name] for name in ("Pressure", "Supply", "Expected", "Deviation", "Phase")]
-    assert {one.time_ns for one in values} == {START_NS + 29_000_000}
-    assert {one.status for one in values} == {Status.GOOD}
+    assert {value.time_ns for value in values} == {START_NS + 29_000_000}
+    assert {value.status for value in values} == {Status.GOOD}
     assert results.health.standing is Standing.OK
     assert results.health.since_ns == START_NS
 
@@ -322,7 +322,11 @@ def test_what_hinders_a_login_is_said_by_the_run(
     users = quick_users(tmp_path / "users.toml", ("scada", "correct horse", Role.LOOK))
 
     def said() -> list[str]:
-        return [one.getMessage() for one in caplog.records if one.name == "drivers.outputs.results"]
+        return [
+            record.getMessage()
+            for record in caplog.records
+            if record.name == "drivers.outputs.results"
+        ]
 
     async def come(url: str) -> None:
         client = Client(url)
@@ -504,9 +508,9 @@ def test_node_opcua_reads_and_subscribes_and_cannot_write(
     assert set(found["write"].values()) == {"BadUserAccessDenied"}
     pressures = seen["rig-01.Meas.Pressure"]
     assert 8 <= len(pressures) <= 20  # one every interval_ms
-    times = [one["time"] for one in pressures]
+    times = [row["time"] for row in pressures]
     assert times == sorted(set(times))
-    assert [one["value"] for one in seen["rig-01.Health.State"]] == [Standing.DEVIATION]
+    assert [row["value"] for row in seen["rig-01.Health.State"]] == [Standing.DEVIATION]
 
 
 class beating:  # noqa: N801 - it reads as a function

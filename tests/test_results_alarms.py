@@ -126,7 +126,7 @@ def test_an_alarm_comes_with_what_is_compared(server: ResultsServer, tmp_path: P
     assert raised["EventType"] == "ns=0;i=10368"  # NonExclusiveDeviationAlarmType
     assert raised["ConditionId"] == f"ns={index};s=rig.Alarms.{LEAK}"
     assert (raised["InputNode"], raised["SetpointNode"]) == tuple(
-        one.format(index) for one in PRESSURE
+        node.format(index) for node in PRESSURE
     )
     assert (raised["SourceName"], raised["ConditionName"]) == ("rig", LEAK)
     assert raised["Message"].startswith(f"{LEAK} raised (medium priority)")
@@ -140,7 +140,7 @@ def test_an_alarm_comes_with_what_is_compared(server: ResultsServer, tmp_path: P
     assert states(cleared) == (False, True, False)
     assert {raised["EnabledState.Id"], raised["SuppressedOrShelved"]} == {True, False}
     names = ("ActiveState.Id", "AckedState.Id", "Retain", "SetpointNode", "Severity")
-    read = [one.Value.Value for one in asked(server, *(f"rig.Alarms.{LEAK}.{n}" for n in names))]
+    read = [node.Value.Value for node in asked(server, *(f"rig.Alarms.{LEAK}.{n}" for n in names))]
     assert read[:3] == [False, True, False]
     assert (read[3].Identifier, read[4]) == ("rig.Model.Expected", 600)
 
@@ -158,7 +158,7 @@ def test_figures_and_the_plc_have_their_own_kinds(server: ResultsServer, tmp_pat
             stream.at(second, cycle(second, *limit, leakage_measured=300.0))
         stream.at(16, event(16, Kind.PLC_STALE))
         told(sink, stream)
-        found = {one["ConditionName"]: one for one in watcher.until(counted(3))}
+        found = {event["ConditionName"]: event for event in watcher.until(counted(3))}
     leak, stale = found["leakage_over_limit"], found["plc_stale"]
     assert leak["InputNode"].endswith("kinds.Cycle.leakage_measured")
     assert leak["SetpointNode"].endswith("kinds.Cycle.leakage_expected")
@@ -191,7 +191,7 @@ def test_who_comes_later_is_told_what_stands(server: ResultsServer, tmp_path: Pa
     sink.resume(Stream(before.desk.before).alarms.standing(), 10**18)
 
     def own(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        return [one for one in found if one["SourceName"] == "later"]
+        return [event for event in found if event["SourceName"] == "later"]
 
     with Watcher(server.url, tmp_path) as watcher:
         time.sleep(2 * HERE.interval_ms * 1e-3)
@@ -277,8 +277,8 @@ def test_who_is_allowed_to_acknowledges_and_others_are_not(tmp_path: Path) -> No
     told, _ = records(tmp_path)
     about = {"unit": "rig", "alarm": LEAK}
     known = ("time", "through", "from")
-    assert {(one["through"], one["from"]) for one in told} == {("opcua", "127.0.0.1")}
-    assert [{name: one[name] for name in one if name not in known} for one in told] == [
+    assert {(record["through"], record["from"]) for record in told} == {("opcua", "127.0.0.1")}
+    assert [{name: record[name] for name in record if name not in known} for record in told] == [
         {"what": "logged_in", "who": "ännchen"},
         {"what": "logged_in", "who": "guest"},
         {"what": "denied", "who": "guest", "wanted": "acknowledged", **about},

@@ -171,7 +171,7 @@ def test_the_process_that_diagnoses_draws_what_it_found(
     _diagnosed(monkeypatch, path, verdict)
     assert json.loads(capsys.readouterr().out) == {"verdict": verdict}
     kept = {"a.html": "in en", "a.de.html": "in de"}
-    assert {one.name: one.read_text() for one in tmp_path.rglob("*.*")} == (
+    assert {file.name: file.read_text() for file in tmp_path.rglob("*.*")} == (
         kept if verdict in ("explained", "unlisted") else {}
     )
 
@@ -191,7 +191,7 @@ def test_the_oldest_reports_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         _diagnosed(monkeypatch, path, "explained")
         os.utime(path, (number, number))
     names = [f"{number}{code}.html" for number in (2, 3, 4) for code in (".de", "")]
-    assert sorted(one.name for one in tmp_path.iterdir()) == names
+    assert sorted(file.name for file in tmp_path.iterdir()) == names
 
 
 def _diagnosed(monkeypatch: pytest.MonkeyPatch, path: Path, verdict: str) -> None:

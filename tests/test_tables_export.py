@@ -97,7 +97,7 @@ def test_other_programs_read_the_ticks_too(tmp_path: Path) -> None:
         column = str(signal.name).lower()
         given = (ticks["signals"] & signal) != 0
         assert 0 < given.sum() < len(given)
-        assert [row[column] for row in rows] == ["1" if one else "0" for one in given]
+        assert [row[column] for row in rows] == ["1" if bit else "0" for bit in given]
         assert table[column] == given.astype(int).tolist()
 
 
