@@ -18,8 +18,8 @@ def test_draws_are_as_wide_as_the_shifts_of_one_sigma(name: str) -> None:
     healthy = Healthy(uncertain=config.monitor.healthy.uncertain)
     rng = np.random.default_rng(1)
     draws = np.array([drawn(config.data, healthy, rng) for _ in range(COUNT)])
-    both = [(up, down) for up, down in shifted(config.data, healthy)]
-    sigma = np.linalg.norm([(up - down) / 2.0 for up, down in both], axis=0)
+    shifts = shifted(config.data, healthy)
+    sigma = np.linalg.norm([(shift.up - shift.down) / 2.0 for shift in shifts], axis=0)
     for coefficient in (c.SUCTION, c.END_RATIO, c.FILM, c.SENSOR_LAG):
         ratio = draws[:, coefficient].std() / sigma[coefficient]
         assert ratio == pytest.approx(1.0, abs=0.12), coefficient

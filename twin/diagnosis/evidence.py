@@ -13,12 +13,13 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from twin.config import Config
+from twin.inference.sensitivities import derivatives
 from twin.live import Twin
 from twin.log.columns import decode, encode
 from twin.model import kernel
@@ -38,7 +39,7 @@ from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import medians_of, surrounded
 from twin.monitor.switching_detector import Knees
-from twin.monitor.uncertain_data import shifted
+from twin.monitor.uncertain_data import Shift, shifted
 from twin.quality import UNUSABLE, Quality
 from twin.signals import (
     MBAR,
@@ -56,6 +57,7 @@ from twin.signals import (
 
 OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
+NEARBY = 0.1  # sigmas of a data set's uncertainty, within which the model is straight
 FASTEST, PIECE = 1, 100_000  # zlib's level, with which a row takes 4 bytes; rows of a piece
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
@@ -71,6 +73,14 @@ def at_once(run: Callable[[Item], Result], over: Sequence[Item]) -> list[Result]
         return [run(item) for item in over]
     with ThreadPoolExecutor(CORES.get()) as pool:
         return list(pool.map(run, over))
+
+
+class LeftOpen(NamedTuple):
+    """Changes of healthy bins (mbar) by each uncertainty of the data set, (bins, uncertainties)."""
+
+    nearby: Floats  # by one sigma, as a small part of it does
+    up: Floats  # by a whole sigma to either side
+    down: Floats
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,7 @@ class Evidence:
     bins: Bins
     terms: tuple[Term, ...]  # of the data set, learned from data
     knees: Knees  # settings with which they were found
-    uncertain: tuple[tuple[Theta, Theta], ...]  # one sigma to either side, for each uncertainty
+    uncertain: tuple[Shift, ...]  # what is open of the data set
     rows: Ints  # subsampled for interpolation of the expected pressure
     calibrated: Theta  # ``theta`` in the surroundings of the calibration
     told: frozenset[str] = frozenset()  # measured surroundings
@@ -185,6 +195,16 @@ class Evidence:
         for lane, off in zip(lanes, at_once(run, lanes), strict=True):
             deviations[:, lane] = off
         return deviations
+
+    @cached_property
+    def left_open(self) -> "LeftOpen":
+        """What the calibration left open of the twin without causes."""
+        ups, downs = ([getattr(shift, side) for shift in self.uncertain] for side in ("up", "down"))
+        near = [self.theta + NEARBY * (up - self.theta) for up in ups]
+        bases = [self.theta, *near, *ups, *downs]
+        _, changes = derivatives(self.off([HEALTHY] * len(bases), bases))
+        nearby, up, down = np.split(changes, 3, axis=1)
+        return LeftOpen(nearby / NEARBY, up, down)
 
     def _drawn(self, courses: Sequence[Schedule], phase: npt.NDArray[np.uint8]) -> Ints:
         """Subsampled rows for interpolation of the pressure expected by these courses."""
@@ -483,7 +503,8 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         base,
         theta=theta,
         uncertain=tuple(
-            (surrounded(up, medians), surrounded(down, medians)) for up, down in base.uncertain
+            Shift(surrounded(up, medians), surrounded(down, medians), tied)
+            for up, down, tied in base.uncertain
         ),
         told=frozenset(medians),
         knees=as_wide_as_needed(base.knees, _Bridged(blocks)),

@@ -6,7 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence
-from twin.diagnosis.residual_covariance import Covariance, Weights, moved, scatter
+from twin.diagnosis.residual_covariance import (
+    Covariance,
+    Weights,
+    moved,
+    opened_by_calibration,
+    scatter,
+)
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
 from twin.monitor.healthy import Healthy, ModelError
@@ -28,7 +34,8 @@ class _HealthyDeviation:
     evidence: Evidence
     off: Floats
     moves: Floats  # by the usual size of each scatter
-    left_open: Floats  # by each uncertainty of the data set
+    left_open: Floats  # by each uncertainty of the data set, as healthy cycles show it
+    beyond: Floats  # and what they do not show
 
     def by(self, healthy: Healthy) -> Covariance:
         """Covariance of bins with the learned error and scatter."""
@@ -38,14 +45,19 @@ class _HealthyDeviation:
 
     def about(self, evidence: Evidence, moves: Floats) -> Covariance:
         """Covariance of bins with these changes by scatter."""
-        nothing = np.zeros(self.left_open.shape[1])  # healthy cycles are of the calibration's day
-        return Covariance(evidence, np.zeros_like(self.off), moves, self.left_open, nothing)
+        no_other_day = np.empty((len(self.off), 0))  # healthy cycles are of the calibration's
+        nothing = np.zeros_like(self.off)  # neither causes nor the day explain anything
+        return Covariance(
+            evidence, nothing, moves, self.left_open, self.beyond, no_other_day, nothing
+        )
 
 
 def learned(evidence: Evidence) -> Healthy:
     """``evidence.healthy`` with the model's error and the scatter learned from its cycles."""
     evidence = replace(evidence, another_day=False)
-    deviation = _HealthyDeviation(evidence, *moved(evidence, HEALTHY, SCATTER, evidence.uncertain))
+    uncertain = [(shift.up, shift.down) for shift in evidence.uncertain]
+    off, moves, opened = moved(evidence, HEALTHY, SCATTER, uncertain)
+    deviation = _HealthyDeviation(evidence, off, moves, *opened_by_calibration(evidence, opened))
     judged = evidence.judged
     halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
     if len(judged) < FEWEST:

@@ -6,10 +6,11 @@ and does not. A share of what a hypothesis explains counts as its error as well.
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.inference import whitening as parts
@@ -69,30 +70,37 @@ class Covariance:
     """Covariance of the bins of the judged cycles about a hypothesis (mbar)."""
 
     evidence: Evidence
-    mismatch: Floats  # one sigma of the error in what is explained, in each bin
+    mismatch: Floats  # by one sigma of the error in what causes explain, in each bin
     moves: Floats  # by one sigma of each scatter, (bins, scatters)
-    left_open: Floats  # by one sigma of each uncertainty of the data set, first and second order
-    of_weather: Floats  # 1 for each column of ``left_open`` that is open by a weather, else 0
+    left_open: Floats  # by one sigma of what calibration left open, as healthy cycles show it
+    beyond: Floats  # by the same, what they do not show; to first order, then to second
+    another_day: Floats  # by one sigma of what the log's day leaves open
+    day_mismatch: Floats  # by one sigma of the error in what the day explains
+    of_weather: bool = False  # whether that day has another weather
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
         """Weights of some cycles; not ``scattered``: without the scatter of effects."""
         evidence, bins = self.evidence, self.evidence.bins
         rows = np.flatnonzero(np.isin(bins.cycle, cycles))
         common, alone = model_error(evidence.healthy.error, bins.kind[rows], bins.time[rows])
-        common = np.hypot(common, self.mismatch[rows])
-        scatter, left_open = self.moves[rows] * float(scattered), self.left_open[rows]
+        scatter = self.moves[rows] * float(scattered)
+        # Healthy cycles have shown how wide this is, but for what is new in this log.
+        learned = evidence.healthy.leftover
+        unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
+        unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
+        mismatches = [self.mismatch[rows], self.day_mismatch[rows]]
         groups = [
             self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle])
             for of_cycle in _runs(bins.cycle[rows])
         ]
-        variance = np.concatenate([np.empty(0), *map(np.diag, groups)]) + common**2
+        variance = np.concatenate([np.empty(0), *map(np.diag, groups)])
+        variance += np.sum([error**2 for error in (common, *mismatches)], axis=0)
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
-        large = left_open**2 > UNSEEN**2 * variance[:, None]
-        unseen = left_open**2 * np.maximum(large, self.of_weather)
-        unmeasured = _row_rms(np.sum(unseen, axis=1), bins.count[rows], 0.0)
-        moves, prior = _in_common(bins, rows, common, left_open)
-        groups = [group * evidence.healthy.leftover**2 for group in groups]
-        moves *= evidence.healthy.leftover
+        is_unseen = unsure**2 > UNSEEN**2 * variance[:, None]
+        is_unseen[:, self.beyond.shape[1] :] |= self.of_weather
+        unmeasured = _row_rms(np.sum(unsure**2 * is_unseen, axis=1), bins.count[rows], 0.0)
+        groups = [group * learned**2 for group in groups]
+        moves, prior = _in_common(bins, rows, [learned * common, *mismatches], unsure)
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
             groups.append(np.diag(sigma**2) + _common_levels(evidence, cycles))
@@ -115,21 +123,23 @@ def _runs(number: Ints) -> list[slice]:
     return [slice(*pair) for pair in pairwise(ends) if pair[0] < pair[1]]
 
 
-def _in_common(bins: Bins, rows: Ints, common: Floats, left_open: Floats) -> tuple[Floats, Floats]:
+def _in_common(
+    bins: Bins, rows: Ints, errors: Sequence[Floats], unsure: Floats
+) -> tuple[Floats, Floats]:
     """Changes of bins (mbar) by what all cycles have in common, and the covariance of that.
 
-    It is the model's error at each time since a stretch began, one sigma of it ``common``, and what
-    the calibration left open.
+    It is each of the model's ``errors`` at each time since a stretch began, by one sigma, and what
+    is ``unsure`` of the data set.
     """
     _, first, place = np.unique(
         (bins.kind[rows] << 32) + bins.since[rows], return_index=True, return_inverse=True
     )
-    at, unknowns = rows[first], len(first) + left_open.shape[1]
-    moves, prior = np.zeros((len(rows), unknowns)), np.eye(unknowns)
-    moves[np.arange(len(rows)), place], moves[:, len(first) :] = common, left_open
+    at = rows[first]
     fading = parts.fading(np.ones(len(first)), bins.time[at], bins.kind[at])
-    prior[: len(first), : len(first)] = fading
-    return moves, prior
+    shares = np.eye(len(first))[place]
+    moves = [shares * error[:, None] for error in errors if error.any()]
+    prior = block_diag(*[fading] * len(moves), np.eye(unsure.shape[1]))
+    return np.hstack([*moves, unsure]), prior
 
 
 def _row_rms(variance: Floats, count: Ints, noise: float) -> float:
@@ -146,16 +156,51 @@ def covariance(
     If the data set is not varied ``both_ways``, its uncertainty counts to first order only. That
     takes half the time, and suffices to compare hypotheses.
     """
-    sizes = scatter(evidence)
-    ambient = _farthest_ambient(evidence, about)
-    uncertain = (*evidence.uncertain, *_another_day(evidence, ambient))
-    off, moves, left_open = moved(evidence, about, sizes, uncertain, both_ways=both_ways)
+    days = _another_day(evidence, _farthest_ambient(evidence, about))
+    uncertain = [(shift.up, shift.down) for shift in evidence.uncertain]
+    off, moves, opened = moved(
+        evidence, about, scatter(evidence), [*uncertain, *days], both_ways=both_ways
+    )
+    is_day = np.tile(np.arange(len(uncertain) + len(days)) >= len(uncertain), 1 + both_ways)
+    left_open, beyond = opened_by_calibration(evidence, opened[:, ~is_day], both_ways=both_ways)
     (healthy,) = evidence.off([HEALTHY]).T
-    of_weather = np.zeros(len(uncertain))
-    if any(cause.effect == WEATHER for cause in about):
-        of_weather[len(evidence.uncertain) :] = 1.0
-    columns = np.tile(of_weather, 1 + both_ways)
-    return Covariance(evidence, MISMATCH * np.abs(healthy - off), moves, left_open, columns)
+    of_weather = any(cause.effect == WEATHER for cause in about)
+    exact = Covariance(
+        evidence,
+        mismatch=MISMATCH * (healthy - off),
+        moves=moves,
+        left_open=left_open,
+        beyond=beyond,
+        another_day=opened[:, is_day],
+        day_mismatch=np.zeros_like(off),
+        of_weather=of_weather,
+    )
+    return replace(exact, day_mismatch=MISMATCH * _explained_by_day(exact, off))
+
+
+def opened_by_calibration(
+    evidence: Evidence, opened: Floats, *, both_ways: bool = True
+) -> tuple[Floats, Floats]:
+    """What calibration left open, as healthy cycles show it and beyond; from whole sigmas.
+
+    Only the calibration's record ties some values to each other. A whole sigma of them at once
+    does not quite suit it, as the model bends. So the twin without causes varies as it does nearby,
+    and what a whole sigma does to it is taken off.
+    """
+    tied = np.array([shift.tied for shift in evidence.uncertain], bool)
+    nearby, up, down = evidence.left_open
+    healthy = np.hstack(central(up, down) if both_ways else (up,))
+    return nearby * tied, opened - healthy * np.tile(tied, 1 + both_ways)
+
+
+def _explained_by_day(residual_covariance: Covariance, off: Floats) -> Floats:
+    """What the log's day probably explains of what is ``off`` (mbar), in each bin."""
+    days, evidence = residual_covariance.another_day, residual_covariance.evidence
+    weights = replace(residual_covariance, another_day=days[:, :0]).of(evidence.judged)
+    white = weights.white(np.column_stack([off, days]))
+    information = white[:, 1:].T @ white[:, 1:] + np.eye(days.shape[1])
+    explained: Floats = days @ np.linalg.solve(information, white[:, 1:].T @ white[:, 0])
+    return explained
 
 
 def _farthest_ambient(evidence: Evidence, about: Hypothesis) -> float:

@@ -234,31 +234,37 @@ def _weather_or_rival(
 ) -> tuple[_Found, list[list[Fitted]]]:
     """The best of weather and its rivals, and those of the others that the log cannot reject.
 
-    Weather may be first by its prior alone. Each is compared with weights about itself: by those
-    about weather, which are wide, a rival would share in what only weather leaves open. A rival
-    must be confirmed on held-out cycles, as weather was.
+    Weather may be first by its prior alone. A rival must be better than weather by two pictures:
+    with weights about each of them, and with those about the rival for both. By those about
+    weather, which are wide, a rival would share in what only weather leaves open; and that width
+    must not be all that speaks against weather. A rival must be confirmed on held-out cycles, as
+    weather was.
     """
-    candidates = [
-        weather,
-        *at_once(lambda rival: _about(evidence, fitted, rival.hypothesis), rivals),
-    ]
 
-    def score(candidate: _Found) -> float:
-        own_score = candidate.found.score + candidate.weights.volume
-        return score_with_tempered_prior(evidence, own_score, candidate.found.hypothesis)
+    def compared(rival: Fitted) -> tuple[_Found, float]:
+        """The rival refitted, and its score less that of weather."""
+        candidate = _about(evidence, fitted, rival.hypothesis)
+        (there,) = fit(evidence, candidate.weights, [weather.found.hypothesis])
+        own = candidate.found.score + candidate.weights.volume
+        own -= weather.found.score + weather.weights.volume
+        return candidate, max(own, candidate.found.score - there.score)
 
-    candidates.sort(key=score)
-    best = next(
-        candidate
-        for candidate in candidates
+    def tempered(entry: tuple[_Found, float]) -> float:
+        candidate, behind = entry
+        return score_with_tempered_prior(evidence, behind, candidate.found.hypothesis)
+
+    compared_rivals = sorted([(weather, 0.0), *at_once(compared, rivals)], key=tempered)
+    best, least = next(
+        (candidate, behind)
+        for candidate, behind in compared_rivals
         if candidate is weather or _confirmed(evidence, fitted, candidate) is candidate.found
     )
     worst = score_without_prior(evidence, best.found.score, best.found.hypothesis)
     worst += CHI2_999 * max(best.found.leftover**2, 1.0)
     comparable = [
-        replace(other.found, score=other.found.score + other.weights.volume - best.weights.volume)
-        for other in candidates
-        if other is not best
+        replace(candidate.found, score=best.found.score + behind - least)
+        for candidate, behind in compared_rivals
+        if candidate is not best
     ]
     return best, [
         [

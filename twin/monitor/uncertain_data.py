@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from pydantic.fields import FieldInfo
@@ -13,21 +14,33 @@ from twin.monitor.healthy import Healthy
 
 # One sigma, relative, of the type's values for how suction and end pressure follow the supply.
 SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
+# Share of a value's sigma by which a way must move it to tie it to others. Chosen: what a record
+# shows of a value, it shows of its neighbours as well; what it does not, stands alone.
+TIES = 0.3
 OF_THE_WAY = 0.9  # largest share of the way to its bound by which a value is moved
 _BOUNDS = ("ge", "gt", "le", "lt")
 
 
-def shifted(data: DataSet, healthy: Healthy) -> Iterator[tuple[Theta, Theta]]:
-    """Coefficients one sigma to either side, for each independent uncertainty of the data set.
+class Shift(NamedTuple):
+    """Coefficients one sigma to either side, by one independent uncertainty of a data set."""
+
+    up: Theta
+    down: Theta
+    tied: bool = False  # several values move together, as only the calibration's record tells
+
+
+def shifted(data: DataSet, healthy: Healthy) -> Iterator[Shift]:
+    """Each independent uncertainty of the data set.
 
     Those of calibration come with those of SUPPLY_UNKNOWN, since only one supply was measured.
     """
     for key, share in SUPPLY_UNKNOWN.items():
         value = getattr(data.supply, key)
-        yield _both_sides(data, {f"supply.{key}": share * value})
-    rows = healthy.uncertain
+        yield Shift(*_both_sides(data, {f"supply.{key}": share * value}))
+    rows = list(healthy.uncertain.items())
     for way in range(len(rows)):
-        yield _both_sides(data, {name: row[way] for name, row in list(rows.items())[way:]})
+        tied = any(abs(row[way]) > TIES * math.hypot(*row) for _, row in rows[way + 1 :])
+        yield Shift(*_both_sides(data, {name: row[way] for name, row in rows[way:]}), tied)
 
 
 def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
