@@ -3,7 +3,8 @@
 import pytest
 
 from twin.alarms.board import SUPPRESSION, Episode
-from twin.alarms.statistics import DAY_NS, WINDOW_NS, Named, in_words, plain, statistics
+from twin.alarms.statistics import WINDOW_NS, Named, in_words, plain, statistics
+from twin.instants import DAY_NS
 
 S = 1_000_000_000
 BEGIN = 1_790_000_000 * S

@@ -14,13 +14,14 @@ from pyarrow import parquet
 
 from twin.config import Config
 from twin.errors import ConfigError
-from twin.figures.costs import DAY_NS, NO_PRICE, Tariff, days, year
+from twin.figures.costs import NO_PRICE, Tariff, days, year
 from twin.figures.costs_text import days_table
 from twin.figures.cycle import CycleFigures, KeyFigures
 from twin.figures.key_figures import FIGURES
 from twin.figures.money import Interval, amount, interval_text, significant
 from twin.figures.settings import FigureSettings
 from twin.figures.simulated import mean_cycle_time
+from twin.instants import DAY_NS
 from twin.live import run as run_loop
 from twin.log.recorder import Recorder
 from twin.monitor.cycles import cut

@@ -12,7 +12,8 @@ from scipy.signal import lfilter
 from twin.figures.key_figures import FIGURES
 from twin.figures.settings import FigureSettings, limits
 from twin.figures.text import _give_or_take, in_words, limit_of, trend_plain
-from twin.figures.trend import DAY_NS, FARTHEST, Line, Trend, line_through, reach, trend_of
+from twin.figures.trend import FARTHEST, Line, Trend, line_through, reach, trend_of
+from twin.instants import DAY_NS
 from twin.model.dataset import DataSet
 from twin.monitor.monitor import MonitorSettings
 

@@ -8,6 +8,7 @@ import time
 from twin.languages.texts import ntr, tr
 
 SECOND_NS = 1_000_000_000
+DAY_NS = 86_400 * SECOND_NS
 DATE, TIME = "%Y-%m-%d", "%H:%M:%S"  # a catalogue has the date of its language
 CALENDAR_NS = 946_684_800 * SECOND_NS  # year 2000: an earlier clock was never set
 

@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.alarms.board import SUPPRESSION, Episode
-from twin.instants import SECOND_NS, instant, lasting
+from twin.instants import DAY_NS, SECOND_NS, instant, lasting
 from twin.languages.texts import numeral, tr
 
-DAY_NS = 86_400 * SECOND_NS
 # Limits that ISA-18.2 (2016) recommends; those of EEMUA 191 (edition 3) are the same.
 WINDOW_NS = 600 * SECOND_NS  # rates are per ten minutes
 MANAGEABLE = 2.0  # average alarms in ten minutes that a person can manage at most

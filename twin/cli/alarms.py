@@ -13,7 +13,7 @@ from twin.cli.options import TABLES, Force, JsonAlone
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError
 from twin.files import refuse_existing, write_json
-from twin.instants import instant
+from twin.instants import DAY_NS, instant
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -128,7 +128,7 @@ def statistics(
 
     Several configurations are the ejectors that one person looks after, counted together.
     """
-    from twin.alarms.statistics import DAY_NS, in_words, plain
+    from twin.alarms.statistics import in_words, plain
     from twin.alarms.statistics import statistics as statistics_of
 
     now_ns = time.time_ns()

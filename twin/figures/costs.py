@@ -11,12 +11,11 @@ import numpy as np
 from twin.figures.cycle import CycleFigures
 from twin.figures.settings import FigureSettings
 from twin.figures.simulated import mean_cycle_time
-from twin.instants import CALENDAR_NS, SECOND_NS, dated
+from twin.instants import CALENDAR_NS, DAY_NS, dated
 from twin.signals import NS
 
 HOUR_S = 3600.0
 NL_PER_M3 = 1e3
-DAY_NS = 86_400 * SECOND_NS
 NO_PRICE = "no price is configured: set price_per_kwh or price_per_m3 under [figures]"
 
 

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure as Picture
 from twin.errors import SourceError
 from twin.figures.database import History
 from twin.figures.key_figures import Figure
-from twin.figures.trend import DAY_NS, Trend
+from twin.figures.trend import Trend
+from twin.instants import DAY_NS
 
 MOST_POINTS = 5000  # of cycles
 TITLE = 110  # characters in a line of the title

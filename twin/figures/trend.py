@@ -19,6 +19,7 @@ from scipy.stats import t as student
 from scipy.stats import theilslopes, trim_mean
 
 from twin.inference.levels import MAD_TO_SIGMA
+from twin.instants import DAY_NS
 
 CONFIDENCE = 0.95  # of bands and intervals
 SURE = 0.99  # confidence that the slope has a sign, for a trend
@@ -32,7 +33,6 @@ AT_ONCE = 0.5  # share of a step within LEAST_BINS before and after it; a slow r
 # have there: a record that only wanders shows a step of some sigmas in one part or another.
 PARTS = ((1.0, 0.0), (0.5, 10.0), (0.25, 10.0))
 LIKELY = 1.92  # difference of log-likelihood that bounds a step's position: 95 %
-DAY_NS = 86_400 * 10**9
 ENDED = 3  # fewest cycles in a row without a value for a figure that is no longer measured
 TRIMMED = 0.1  # share of the bins cut off on either side before their mean is taken
 MOST_ALIKE = 0.95  # correlation of neighbours

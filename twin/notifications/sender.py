@@ -9,6 +9,7 @@ from typing import Protocol
 
 from twin.backoff import Backoff
 from twin.errors import SourceError, in_words
+from twin.instants import DAY_NS
 from twin.notifications.message import Message, again
 from twin.notifications.outbox import Outbox
 from twin.notifications.settings import Outlet
@@ -21,7 +22,6 @@ LOOK_S = 30.0  # interval at which the outbox is read without a wake-up
 GRACE_S = 3.0  # for deliveries when the program ends
 ALARM = "alarm"  # the topic of alarms
 HOUR_NS = 3600 * 1_000_000_000
-DAY_NS = 86_400 * 1_000_000_000
 
 
 class LostError(SourceError):

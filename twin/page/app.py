@@ -32,9 +32,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from twin.alarms.state import Deed
-from twin.alarms.statistics import DAY_NS, in_words, statistics
+from twin.alarms.statistics import in_words, statistics
 from twin.audit import Act
 from twin.errors import TwinError
+from twin.instants import DAY_NS
 from twin.languages.catalogues import Catalogues
 from twin.languages.texts import speaking, tr
 from twin.login import Authenticator

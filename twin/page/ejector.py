@@ -25,8 +25,8 @@ from twin.figures.database_url import open_chosen as open_figures
 from twin.figures.key_figures import FIGURES, Figure
 from twin.figures.settings import Limits
 from twin.figures.text import course_in_words, title_of, trend_of_figure
-from twin.figures.trend import DAY_NS, Trend
-from twin.instants import zone
+from twin.figures.trend import Trend
+from twin.instants import DAY_NS, zone
 from twin.languages.choice import translation_of
 from twin.languages.texts import tr
 from twin.page import ring
