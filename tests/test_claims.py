@@ -19,7 +19,7 @@ from twin.alarms import statistics
 from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
 from twin.figures import cycle_view as course
-from twin.figures import key_figures, trend
+from twin.figures import key_figures, retention, trend
 from twin.figures import writer as keeper
 from twin.fleet import peers, report
 from twin.hil import LONGEST_GAP_S
@@ -129,6 +129,7 @@ CLAIMS = (
     ("log-format", "A chunk is completed each {:g} s", (), (recorder.FLUSH_S,)),
     ("log-format", "receipts of {:g} s windows", (), (clock.WINDOW_NS * 1e-9,)),
     ("log-format", "from {:g} ms on where the PLC counts its scans", (), (clock.SET_NS * 1e-6,)),
+    ("operation", "It deletes about {} rows at a time", (), (retention.PORTION,)),
     ("opcua", "the last {} events", (), (KEPT,)),
     ("opcua", "or no row has come for {}", ("a second",), (NO_ROW_S,)),
 )

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from twin.assets.unit import Unit
 from twin.cli.figures import figures_app
 from twin.errors import ConfigError, SourceError
 from twin.figures.database import VALUES, open_store
+from twin.instants import clock
 from twin.live import run as run_loop
 from twin.log.header import LogHeader
 from twin.log.recorder import Recorder
@@ -159,6 +161,32 @@ def test_counters_are_erased(figures: Run) -> None:
     fill(1, 50)
     assert counted(figures("counters")) == [["50", "50"], ["50", "50"], ["0", "0"]]
     assert counted(figures("counters", "--erase")) == [["50", "0"], ["50", "0"], ["0", "0"]]
+
+
+def test_deleted_cycles_are_named_and_still_counted(
+    log: Path, figures: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the cycles are deleted, and then those of a log."""
+    fill(10, 100)
+    with open_store("figures.sqlite") as store:
+        store.delete(UNIT, 10**18 + 5 * DAY, most=1000)
+        deleted = clock(store.deleted_until(UNIT) or 0, time.time_ns())
+    note = f"twin: cycles up to {deleted} are deleted; only later ones are used\n"
+    figures_app(["trend", "leakage"], standalone_mode=False)
+    shown = capsys.readouterr()
+    assert note in shown.err
+    assert "over 5 days" in shown.out
+    assert figures("export", "-o", "f.csv") == "50 cycles in f.csv\n"
+    assert counted(figures("counters")) == [["100", "100"], ["100", "100"], ["0", "0"]]
+    figures_app(["show", str(log), "--keep"], standalone_mode=False)
+    assert "not added again" not in capsys.readouterr().err
+    with open_store("figures.sqlite") as store:
+        store.delete(UNIT, 2 * 10**18, most=1000)
+    figures_app(["show", str(log), "--keep"], standalone_mode=False)
+    shown = capsys.readouterr()
+    assert "0 new of 10 cycles" in shown.out
+    assert "twin: 10 cycles are as old as those that" in shown.err
+    assert counted(figures("counters"))[0] == ["110", "110"]
 
 
 def test_autoset_gives_what_stands_in_a_configuration(figures: Run) -> None:

@@ -15,7 +15,7 @@ import pytest
 from twin.assets.database import open_assets
 from twin.assets.unit import Unit
 from twin.errors import ConfigError, SourceError
-from twin.figures.database import VALUES, Counters, Store, open_store
+from twin.figures.database import LIVE, VALUES, Counters, Store, open_store
 from twin.figures.database_url import FILE, open_chosen
 from twin.settings import Document
 
@@ -106,6 +106,98 @@ def test_counters_have_twins_that_can_be_erased(url: str) -> None:
         assert store.counters(RIG) == Counters(6, 11, 1)
         assert store.counters(RIG, erasable=True) == Counters(2, 3, 0)
         assert store.counters(GRIPPER, erasable=True) == Counters(0, 0, 0)
+
+
+def both_counters(store: Store) -> tuple[Counters, Counters]:
+    return store.counters(RIG), store.counters(RIG, erasable=True)
+
+
+def test_deleting_cycles_changes_no_counter(url: str) -> None:
+    """Nine cycles, two of them stored with two data sets; erasable counters begin in the midst."""
+    now = [cycle(2)["host_ns"] + 1]
+    cycles = [cycle(number, alarms=number % 2) for number in range(9)]
+    with open_store(url, clock=lambda: now[0]) as store:
+        add(store, *cycles)
+        add(store, *cycles[1:3], data_set="b")
+        add(store, *cycles, unit=GRIPPER)
+        store.erase(RIG)
+        before = both_counters(store)
+        assert before == (Counters(9, 18, 4), Counters(6, 12, 3))
+        rows = []
+        while not rows or rows[-1]:  # the rows of a cycle go together, even beyond a portion
+            rows.append(store.delete(RIG, cycle(6)["host_ns"], most=2))
+            assert both_counters(store) == before
+        assert rows == [3, 2, 2, 1, 0]
+        assert store.deleted_until(RIG) == cycle(5)["host_ns"]
+        assert store.history(RIG).cycle.tolist() == [6, 7, 8]
+        assert len(store.history(GRIPPER).cycle) == 9
+        assert store.deleted_until(GRIPPER) is None
+        now[0] = cycle(8)["host_ns"] + 1
+        store.erase(RIG)
+        add(store, cycle(9))
+        assert both_counters(store) == (Counters(10, 20, 4), Counters(1, 2, 0))
+        store.delete(RIG, cycle(20)["host_ns"], most=100)
+        assert both_counters(store) == (Counters(10, 20, 4), Counters(1, 2, 0))
+        assert store.units() == [GRIPPER, RIG]
+
+
+KEY = "asset_type, asset_id, host_ns, begin_ns, data_set"
+HELD = (  # a cycle that another table refers to cannot be deleted
+    "CREATE TABLE held (asset_type TEXT, asset_id TEXT, host_ns BIGINT, begin_ns BIGINT,"
+    f" data_set TEXT, FOREIGN KEY ({KEY}) REFERENCES figure_cycle ({KEY}))",
+    f"INSERT INTO held SELECT {KEY} FROM figure_cycle WHERE cycle = 2",
+)
+
+
+@pytest.mark.parametrize(
+    ("sabotage", "repair"),
+    [
+        (HELD, "DROP TABLE held"),
+        (
+            ["ALTER TABLE figure_deleted RENAME TO away"],
+            "ALTER TABLE away RENAME TO figure_deleted",
+        ),
+    ],
+    ids=["the rows stay", "the sums cannot be carried"],
+)
+def test_a_deletion_that_ends_half_way_has_changed_nothing(
+    url: str, sabotage: list[str], repair: str
+) -> None:
+    cycles = [cycle(number, alarms=1) for number in range(4)]
+    with open_store(url) as store:
+        add(store, *cycles)
+        for statement in sabotage:
+            execute(url, statement)
+        with pytest.raises(SourceError, match="figure database"):
+            store.delete(RIG, cycle(3)["host_ns"], most=100)
+        execute(url, repair)
+        assert store.history(RIG).cycle.tolist() == [0, 1, 2, 3]
+        assert store.counters(RIG) == Counters(4, 8, 4)
+        assert store.delete(RIG, cycle(3)["host_ns"], most=100) == 3
+        assert store.counters(RIG) == Counters(4, 8, 4)
+
+
+def test_a_log_of_deleted_cycles_is_not_counted_again(url: str) -> None:
+    with open_store(url) as store:
+        add(store, *(cycle(number) for number in range(6)))
+        store.delete(RIG, cycle(4)["host_ns"], most=100)
+        assert add(store, *(cycle(number) for number in range(8))) == 2
+        assert store.counters(RIG).cycles == 8
+        # The clock of a run may have been set back. Its cycles are new all the same.
+        assert store.add(RIG, "a", LIVE, [cycle(3, begin_ns=7)]) == 1
+        store.delete(RIG, cycle(4)["host_ns"], most=100)
+        assert store.deleted_until(RIG) == cycle(3)["host_ns"]
+        assert store.counters(RIG).cycles == 9
+
+
+def test_a_database_of_an_older_program_gets_what_deletion_needs(url: str) -> None:
+    with open_store(url) as store:
+        add(store, cycle(1), cycle(2))
+    execute(url, "DROP TABLE figure_deleted")
+    with open_store(url) as store:
+        assert store.counters(RIG).cycles == 2
+        assert store.delete(RIG, cycle(2)["host_ns"], most=100) == 1
+        assert store.counters(RIG).cycles == 2
 
 
 def test_a_batch_is_added_whole_or_not_at_all(url: str) -> None:

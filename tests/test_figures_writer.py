@@ -1,9 +1,11 @@
 """Key figures on their way from the loop into the database."""
 
 import queue
+import sqlite3
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from twin.figures import writer as module
 from twin.figures.cycle import KeyFigures
 from twin.figures.database import Store, open_store
 from twin.figures.read import of_log
+from twin.figures.retention import LOOK_S, PORTION, Retention
 from twin.figures.writer import Alarms, Keeper
 from twin.live import run
 from twin.log.header import LogHeader
@@ -188,6 +191,112 @@ def test_a_configuration_says_whether_and_where_figures_are_kept(tmp_path: Path)
     assert said == []
     with open_store(tmp_path / "figures.sqlite") as store:
         assert store.history(UNIT).cycle.tolist() == [1]
+
+
+DAY = 86_400 * 10**9
+
+
+def old_and_new(path: Path) -> None:
+    """A database with a cycle of 40 days ago and one of 20 days ago."""
+    with open_store(path) as store:
+        ages = [{**cycle(n).data, "host_ns": time.time_ns() - n * DAY} for n in (40, 20)]
+        store.add(UNIT, "a", "live", ages)
+
+
+def run_once(folder: Path, table: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Store cycles as configured, until the keeper has looked for old ones; what it said."""
+    said: list[str] = []
+    opened = keeper_of(configured(folder, table), said.append)
+    assert opened is not None
+    monkeypatch.setattr(module, "BATCH_S", 0.01)
+    keeper = opened()
+    with open_store(folder / "figures.sqlite") as store:
+        for number in range(2):  # the second is stored after the first deletion
+            data = {**cycle(number).data, "host_ns": time.time_ns()}
+            keeper.write(*NONE, [Event(0, Kind.CYCLE, "", data)])
+            end = time.monotonic() + 20
+            while store.counters(UNIT).cycles < 3 + number and time.monotonic() < end:
+                time.sleep(0.005)
+    keeper.close()
+    return said
+
+
+def test_old_cycles_are_deleted_if_the_configuration_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old_and_new(tmp_path / "figures.sqlite")
+    said = run_once(tmp_path, "[figures]\nkeep = true\nkeep_days = 30\n", monkeypatch)
+    assert said == [
+        "key figures of cycles older than 30 days are deleted ([figures] keep_days);"
+        " the counters keep them"
+    ]
+    with open_store(tmp_path / "figures.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [20, 0, 1]
+        assert store.counters(UNIT).cycles == 4
+
+
+def test_all_cycles_are_kept_if_nothing_is_configured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old_and_new(tmp_path / "figures.sqlite")
+    assert run_once(tmp_path, "[figures]\nkeep = true\n", monkeypatch) == []
+    with open_store(tmp_path / "figures.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [40, 20, 0, 1]
+
+
+def test_old_cycles_go_in_portions_and_then_once_a_minute() -> None:
+    said: list[str] = []
+    uptime, portions = [0.0], iter([PORTION, PORTION + 1, 3, 0])
+    asked: list[int] = []
+
+    class Old:
+        def delete(self, _unit: Unit, before_ns: int, most: int) -> int:
+            assert most == PORTION
+            asked.append(before_ns)
+            return next(portions)
+
+    retention = Retention(30.0, said.append, lambda: 100 * DAY, lambda: uptime[0])
+
+    def portions_by(second: float) -> int:
+        uptime[0] = second
+        retention.apply(Old(), UNIT)  # type: ignore[arg-type]
+        return len(asked)
+
+    assert [portions_by(second) for second in (0, 2, 4, 6, 63, 64)] == [1, 2, 3, 3, 3, 4]
+    assert asked == [70 * DAY] * 4
+    assert len(said) == 1
+
+
+def test_a_locked_database_is_reported_once_and_tried_again(tmp_path: Path) -> None:
+    path, said, uptime = tmp_path / "f.sqlite", list[str](), [0.0]
+    old_and_new(path)
+    retention = Retention(30.0, said.append, uptime=lambda: uptime[0])
+    with open_store(path, busy_s=0.01) as store, closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        for _ in range(2):
+            retention.apply(store, UNIT)
+            uptime[0] += LOOK_S
+        assert len(said) == 1
+        assert said[0].startswith("old key figures cannot be deleted: ")
+        assert "database is locked" in said[0]
+        other.rollback()
+        retention.apply(store, UNIT)
+        assert store.history(UNIT).cycle.tolist() == [20]
+        assert store.counters(UNIT).cycles == 2
+
+
+def test_cycles_are_stored_although_old_ones_cannot_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> int:
+        raise MemoryError
+
+    monkeypatch.setattr(Store, "delete", fail)
+    old_and_new(tmp_path / "figures.sqlite")
+    said = run_once(tmp_path, "[figures]\nkeep = true\nkeep_days = 30\n", monkeypatch)
+    assert said == ["old key figures cannot be deleted: MemoryError: "]
+    with open_store(tmp_path / "figures.sqlite") as store:
+        assert store.history(UNIT).cycle.tolist() == [40, 20, 0, 1]
 
 
 def test_what_is_wrong_in_the_configuration_is_said_before_the_run(tmp_path: Path) -> None:

@@ -13,9 +13,12 @@ from starlette.websockets import WebSocketDisconnect
 from user_files import authenticator_of, quick_users
 
 from twin.alarms import writer as keeper_module
+from twin.assets.unit import Unit
 from twin.audit import records
 from twin.errors import ConfigError
 from twin.events import Kind
+from twin.figures.database import open_store as open_figures
+from twin.instants import DAY_NS, clock
 from twin.page import app as module
 from twin.page.app import COOKIE, STATIC, Access, Page
 from twin.page.ejector import Ejector
@@ -230,6 +233,26 @@ def test_errors_are_plain_pages_and_plain_json(site: Site) -> None:
     away = site.client.get("/api/ejectors/0/trends/leakage")
     assert (away.status_code, "no such figure database" in away.json()["error"]) == (503, True)
     assert site.client.get("/api/ejectors/0/trends/nonsense").status_code == 400
+
+
+def test_a_trend_names_the_cycles_that_are_deleted(site: Site) -> None:
+    asset = site.config.asset
+    unit = Unit(asset.type, asset.id)
+    ages = range(20)  # days, of a cycle each
+    cycles = [
+        {"cycle": age, "begin_ns": age, "host_ns": NOW - age * DAY_NS, "warnings": []}
+        for age in ages
+    ]
+    path = Path(site.config.document.name).parent / "figures.sqlite"
+    with open_figures(path) as store:
+        store.add(unit, "a", "live", cycles)
+        store.delete(unit, NOW - 9 * DAY_NS, most=100)
+    month = site.client.get("/api/ejectors/0/trends/leakage?days=30").json()
+    assert month["cycles"] == 10
+    deleted = clock(NOW - 10 * DAY_NS, NOW)
+    assert f"(cycles up to {deleted} are deleted; only later ones are used)" in month["words"]
+    week = site.client.get("/api/ejectors/0/trends/leakage?days=7").json()
+    assert "deleted" not in week["words"]
 
 
 def test_a_report_is_shown_and_nothing_in_it_is_run(site: Site) -> None:

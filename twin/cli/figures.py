@@ -27,7 +27,8 @@ from twin.errors import ConfigError
 from twin.files import refuse_existing, require_writable, write_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+    from typing import Any
 
     from twin.assets.unit import Unit
     from twin.config import Config
@@ -108,6 +109,7 @@ def show(
         with _open(figures, config, write=True) as store:
             count = store.add(unit, data_set, log.name, plain)
             print(f"{count} new of {len(plain)} cycles, in {store.name}")
+            _say_if_deleted(store, unit, plain)
 
 
 @figures_app.command()
@@ -302,6 +304,7 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     from twin.assets.unit import Unit
     from twin.figures.database import FIGURE_DATABASE
     from twin.figures.database_url import open_chosen
+    from twin.figures.retention import Retention
     from twin.figures.settings import FigureSettings
     from twin.figures.writer import Keeper
 
@@ -311,7 +314,9 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     parse_url(figure_settings.url, FIGURE_DATABASE)
     unit = Unit(settings.asset.type, settings.asset.id)
     open_database = partial(open_chosen, "", settings.document, write=True)
-    return lambda: Keeper(open_database, unit, settings.data.hash, say)
+    days = figure_settings.keep_days
+    retention = None if days is None else Retention(days, say)
+    return lambda: Keeper(open_database, unit, settings.data.hash, say, retention)
 
 
 # --- what the commands share --------------------------------------------------------------------
@@ -390,13 +395,32 @@ def _cycles(recorded: "Log", settings: "Config") -> "list[CycleFigures]":
     return [cycle for cycle, _ in of_log(recorded, key_figures_of(settings))]
 
 
+def _say_if_deleted(store: "Store", unit: "Unit", cycles: "Sequence[Mapping[str, Any]]") -> None:
+    """Say how many cycles of a log the database does not take, since it has deleted such."""
+    deleted = store.deleted_until(unit)
+    count = 0 if deleted is None else sum(cycle["host_ns"] <= deleted for cycle in cycles)
+    if count:
+        print(
+            f"twin: {count} cycles are as old as those that {store.name} has deleted, and are not"
+            " added again",
+            file=sys.stderr,
+        )
+
+
 def _history(
     store: "Store", unit: "Unit", days: float | None, columns: "Sequence[str] | None" = None
 ) -> "History":
-    since = None if days is None else time.time_ns() - round(days * 86_400e9)
+    from twin.figures.text import deleted_in_words
+    from twin.instants import DAY_NS
+
+    now_ns = time.time_ns()
+    since = None if days is None else now_ns - round(days * DAY_NS)
     history = store.history(unit, since, *([] if columns is None else [columns]))
     if not len(history.host_ns):
         raise ConfigError(f"{store.name}: no cycles of {unit.id or unit.type} in that time")
+    deleted = store.deleted_until(unit)
+    if deleted is not None and (since is None or since <= deleted):
+        print(f"twin: {deleted_in_words(deleted, now_ns)}", file=sys.stderr)
     return history
 
 

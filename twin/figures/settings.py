@@ -39,6 +39,8 @@ class FigureSettings(DatabaseSettings):
     operating_hours: Annotated[float, Field(gt=0.0, le=8784.0)] = 4000.0
     autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
     keep: bool = False  # twin run adds its cycles to the database
+    # Cycles older than this are deleted, and stay counted; by default all are kept.
+    keep_days: Positive | None = None
 
     @model_validator(mode="after")
     def _range_is_one(self) -> Self:

@@ -234,6 +234,12 @@ def _comes(comes: Reach | None, line: Line, limit: str) -> str:
     )
 
 
+def deleted_in_words(until_ns: int, now_ns: int) -> str:
+    """Which cycles are no longer there to be judged."""
+    until = clock(until_ns, now_ns)
+    return tr("cycles up to {until} are deleted; only later ones are used", until=until)
+
+
 def trend_plain(figure: Figure, trend: Trend) -> dict[str, Any]:
     """The same for JSON; null where there is nothing to say."""
     plain: dict[str, Any] = {"figure": figure.name, "unit": figure.unit, "limit": trend.limit}

@@ -8,7 +8,8 @@ from typing import Any
 from twin.assets.unit import Unit
 from twin.errors import in_words
 from twin.events import Event, Kind, Severity
-from twin.figures.database import Store
+from twin.figures.database import LIVE, Store
+from twin.figures.retention import Retention
 from twin.signals import Samples, Ticks
 
 BATCH_S = 2.0  # cycles of this time are written together
@@ -37,7 +38,7 @@ class Keeper:
     """A sink that stores the key figures of CYCLE events, in a thread of its own.
 
     A failure to write is reported once, and cycles wait until writing works again; the loop goes on
-    in every case.
+    in every case. Old cycles are deleted if a ``retention`` is given.
     """
 
     def __init__(  # everything that makes a row whole
@@ -46,10 +47,11 @@ class Keeper:
         unit: Unit,
         data_set: str,
         say: Callable[[str], None],
-        source: str = "live",
+        retention: Retention | None = None,
     ) -> None:
         self._open_store = open_store
-        self._origin = unit, data_set, source
+        self._origin = unit, data_set, LIVE
+        self._retention = retention
         self._say = say
         self._alarms = Alarms()
         self._store: Store | None = None
@@ -81,6 +83,8 @@ class Keeper:
         pause = BATCH_S
         while not self._ending.wait(pause):
             pause = BATCH_S if self._write_waiting() else RETRY_S
+            if self._retention is not None and self._store is not None:
+                self._retention.apply(self._store, self._origin[0])
         if not self._write_waiting():
             text = f"key figures of {len(self._waiting)} cycles could not be stored"
             self._say(f"{text}; from a log: twin figures show LOG --keep")

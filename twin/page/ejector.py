@@ -24,7 +24,7 @@ from twin.figures.database import SIDES
 from twin.figures.database_url import open_chosen as open_figures
 from twin.figures.key_figures import FIGURES, Figure
 from twin.figures.settings import Limits
-from twin.figures.text import course_in_words, title_of, trend_of_figure
+from twin.figures.text import course_in_words, deleted_in_words, title_of, trend_of_figure
 from twin.figures.trend import Trend
 from twin.instants import DAY_NS, zone
 from twin.languages.choice import translation_of
@@ -273,6 +273,7 @@ class Ejector:
         since = self._clock() - round(days * DAY_NS)
         with open_figures("", self.config.document, write=False) as store:
             history = store.history(self._unit, since, columns)
+            deleted = store.deleted_until(self._unit)
         document: dict[str, Any] = {
             **figure_labels(figure),
             "cycles": len(history.cycle),
@@ -282,6 +283,8 @@ class Ejector:
         trend = trend_of_figure(history, figure, self._limits())
         stride = max(1, math.ceil(len(history.cycle) / MOST_POINTS))
         words = f"{title_of(name)}: {course_in_words(figure, trend, self._clock())}"
+        if deleted is not None and since <= deleted:
+            words += f" ({deleted_in_words(deleted, self._clock())})"
         document |= {"words": words, "limit": trend.limit, "every": stride}
         document |= {"time": (history.host_ns[::stride] / S_NS).tolist()}
         document |= {
