@@ -589,6 +589,13 @@ def test_the_nozzle_may_be_seen_late_the_same_in_all_cycles() -> None:
     assert other == pytest.approx(one, rel=0.1)
 
 
+def test_too_few_cycles_are_refused_for_commissioning() -> None:
+    """It is the first command of a new user, to whom nobody has spoken of a calibration."""
+    of = logged(SEED, KIND, 4)
+    with pytest.raises(ConfigError, match=r"complete cycles that count; commissioning needs 5$"):
+        commission(config_of(of.truth.readable), [samples_of(of)], quiet)
+
+
 def test_what_few_cycles_show_counts_neither_as_left_nor_as_floor() -> None:
     """A hold that goes on for longer than others: nobody knows what of it is scatter."""
     off = np.array([1.0, 2.0, 3.0, 4.0, 2.0, 3.0]) * MBAR

@@ -78,6 +78,7 @@ def test_a_log_is_shown_with_what_was_expected(figures: Run, log: Path) -> None:
     cycles, curve = figures("show", log).split("\n\n")
     head, *rows = cycles.splitlines()
     assert curve.startswith("read off the curve, without a model; vacuum counts from the record's")
+    assert "open_cup is missing in 10 of 10 suctions: the evacuation begins at once" in curve
     assert head.split()[:3] == ["cycle", "t0", "(ms)"]
     assert len(rows) == 10  # the last one cut off
     assert rows[3].split()[0] == "3"

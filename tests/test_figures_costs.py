@@ -134,10 +134,10 @@ def test_without_a_clock_days_count_from_the_first_cycle(cycles: list[CycleFigur
 def test_why_a_year_is_not_told_is_said(cycles: list[CycleFigures]) -> None:
     assert days([]) == []
     text = days_table([], year([], tariff()), tariff())
-    assert "a year: not told, the log has fewer than two cycles" in text
+    assert "a year: unknown, the log has fewer than two cycles" in text
     unknown = [replace(cycle, measured={"air": math.nan}) for cycle in cycles]
     text = days_table(days(unknown), year(unknown, tariff()), tariff())
-    assert "a year: not told, no cycle's air is known" in text
+    assert "a year: unknown, no cycle's air is known" in text
 
 
 # The command.

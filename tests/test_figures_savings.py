@@ -201,4 +201,4 @@ def test_a_log_without_a_complete_cycle_is_refused(figures: Run, tmp_path: Path)
     run_loop([rows], rigs.twin("gripper"), rigs.monitor("gripper"), sinks)
     with pytest.raises(ConfigError, match="no complete cycle"):
         figures("savings", path)
-    assert "a year: not told, the log has fewer than two cycles" in figures("costs", path)
+    assert "a year: unknown, the log has fewer than two cycles" in figures("costs", path)

@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import re
 import sys
 from pathlib import Path
 
@@ -186,6 +187,14 @@ def test_what_is_wrong_is_said_and_nothing_is_written(
 
 
 # Examples.
+
+
+@pytest.mark.parametrize("name", STARTERS)
+def test_an_example_refers_to_pages_and_not_to_sources(name: str) -> None:
+    named = re.findall(r"[\w./-]+\.(?:py|md)\b", rigs.path_of(name).read_text())
+    assert "docs/configuration.md" in named
+    assert [page for page in named if not page.startswith("docs/")] == []
+    assert [page for page in named if not (rigs.ROOT / page).is_file()] == []
 
 
 @pytest.mark.parametrize("name", STARTERS)

@@ -36,6 +36,7 @@ BANNED = {
     r"\bwhat speaks for it\b": "evidence",
     r"\bnothing waits\b": "the queue is empty",
     r"\bas wide as needed\b": "say how wide, and why",
+    r"\bnot told of\b": "unknown or missing, and in how many",
     r"\bso many of them\b": "say how many",
     r"\bthe less of what\b": "two quantities and how one follows the other",
 }

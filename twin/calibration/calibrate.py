@@ -58,7 +58,7 @@ def calibrate(
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
     config = replace(config, data=taken_in(config.data, samples))
     before = complete(config.data, samples)
-    refuse_insufficient(samples, before)
+    refuse_insufficient(samples, before, "calibration")
     refuse_contradicting(before, config.data)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
@@ -78,8 +78,8 @@ def complete(data: DataSet, samples: Samples) -> list[Cycle]:
     return [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
 
 
-def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
-    """ConfigError if there is not enough to calibrate on."""
+def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle], purpose: str) -> None:
+    """ConfigError if there is not enough for ``purpose``, which the message names."""
     if not (samples["commands"] & Command.SUCTION).any():
         raise ConfigError("the log has no suction phase", "check which tag is suction")
     spoilt = np.isnan(samples["pressure"]) | ((samples["quality"] & UNUSABLE) != 0)
@@ -96,7 +96,7 @@ def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle]) -> None:
         )
     if len(cycles) < FEWEST:
         raise ConfigError(
-            f"the log has {len(cycles)} complete cycles that count; a calibration needs {FEWEST}",
+            f"the log has {len(cycles)} complete cycles that count; {purpose} needs {FEWEST}",
             "record suction, blow-off and idle again and again without a gap",
         )
 

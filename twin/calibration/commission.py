@@ -148,7 +148,7 @@ def commission(
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
     guess, remarks = guessed(config.data, readings)
     before = complete(guess, samples)
-    refuse_insufficient(samples, before)
+    refuse_insufficient(samples, before, "commissioning")
     switching_data = switching(guess, samples)
     contradictory = contradictions(
         before if switching_data is guess else complete(switching_data, samples), switching_data

@@ -66,10 +66,10 @@ def _cells(name: str, cycles: int, air: float, tariff: Tariff) -> list[str]:
 def _year_line(yearly: YearlyConsumption, tariff: Tariff) -> str:
     """A year in a sentence, or why it is unknown."""
     if not math.isfinite(yearly.cycles):
-        return "a year: not told, the log has fewer than two cycles"
+        return "a year: unknown, the log has fewer than two cycles"
     if not math.isfinite(yearly.air):
         return (
-            "a year: not told, no cycle's air is known; record pressure and commands at least"
+            "a year: unknown, no cycle's air is known; record pressure and commands at least"
             " every 10 ms"
         )
     texts = [

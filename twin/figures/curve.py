@@ -172,7 +172,7 @@ def open_cup(stretch: Stretch) -> Reading:
     if width > max(CLEAR * stretch.noise, SWING):
         return Reading(math.nan, why="no vacuum stands still before the evacuation")
     if level < max(LEAST_VACUUM, CLEAR * stretch.noise):
-        return Reading(math.nan, why="the vacuum before the evacuation is not told from none")
+        return Reading(math.nan, why="the vacuum before the evacuation cannot be told from zero")
     return Reading(level, max(width, SIGMAS_95 * stretch.noise))
 
 

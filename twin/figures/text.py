@@ -67,7 +67,7 @@ def _missing(all_figures: Sequence[Mapping[str, Reading]]) -> list[str]:
         reasons = Counter(figures[name].why for figures in all_figures if figures[name].why)
         if reasons:
             (reason, _), count = reasons.most_common(1)[0], sum(reasons.values())
-            lines.append(f"{name}: not told of {count} of {len(all_figures)}: {reason}")
+            lines.append(f"{name} is missing in {count} of {len(all_figures)} suctions: {reason}")
     return lines
 
 
