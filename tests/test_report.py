@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import rigs
+from matplotlib.text import Annotation
 from written_pages import ENGLISH_WORDS, visible
 
 from twin.diagnosis import drawing
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.drawing import as_svg
+from twin.diagnosis.drawing import as_narrow_svg, as_svg
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.held_out import Judged, judge
@@ -516,6 +517,36 @@ def test_a_german_sentence_has_the_form_for_its_count(german: dict[str, str]) ->
 # --- the pictures ---------------------------------------------------------------------------------
 
 
+def test_a_picture_for_a_phone_leaves_the_other_as_it_is() -> None:
+    picture = draw_cycle(found("explained"), 4, "")
+    wide = as_svg(picture)
+    narrow = as_narrow_svg(picture)
+    assert as_svg(picture) == wide
+    sizes = [float(ET.fromstring(svg).attrib["width"].removesuffix("pt")) for svg in (wide, narrow)]
+    assert sizes == pytest.approx([72.0 * drawing.WIDTH, 72.0 * drawing.NARROW])
+    ids = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in (wide, narrow)]
+    assert ids[0]
+    assert not ids[0] & ids[1]  # both stand in one page
+
+
+def test_names_of_short_phases_do_not_touch_on_a_phone() -> None:
+    """Of four phases the third is short: its name stands above that of the second."""
+    with drawing.empty("names", 2.0, "") as picture:
+        axes = picture.subplots()
+        axes.set_xlim(0.0, 100.0)
+        for x, name in ((30.0, "suction"), (68.0, "hold"), (75.0, "blow-off"), (92.0, "idle")):
+            picture.name_above(axes, x, name)
+
+    def raised() -> list[bool]:
+        heights = [text.xyann[1] for text in axes.texts if isinstance(text, Annotation)]
+        return [height > drawing.ABOVE for height in heights]
+
+    picture.resize(drawing.NARROW, 2.0)
+    assert raised() == [False, False, True, False]
+    picture.resize(drawing.WIDTH, 2.0)
+    assert raised() == [False] * 4
+
+
 def test_pictures_are_svg_with_a_text_alternative() -> None:
     one = found("explained")
     for svg in (
@@ -709,7 +740,7 @@ def test_what_is_left_is_drawn_over_time_and_vacuum_with_its_term() -> None:
     other = Term(where="idle", over="vacuum", at=(0.0,), mbar=(1.0,))
     plain = as_svg(draw_left(found("unlisted"), laid("unlisted"), ""))
     assert "left in blow-off" in plain
-    assert "vacuum (mbar below ambient)" in plain
+    assert "(mbar below ambient)" in plain
     assert "term in" not in plain
     with_term = replace(found("unlisted"), terms=[term, other])
     svg = as_svg(draw_left(with_term, laid("unlisted"), ""))

@@ -1,7 +1,9 @@
 """Pages of a commissioning and of a fleet: German throughout, and fit for keyboard and phone."""
 
+import io
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,13 +11,16 @@ import rigs
 from accessible import violations
 from calibrations import log_of
 from command_line import twin
-from playwright.sync_api import Browser
+from PIL import Image
+from playwright.sync_api import Browser, ViewportSize
 from test_fleet_report import some_of_all
 from test_report import explained
 from test_retelling import shape_of, written_in
 from written_pages import ENGLISH_WORDS, UNIT, commissioned, visible
 
 from twin.calibration.page import write_page as write_commissioning
+from twin.diagnosis import drawing
+from twin.diagnosis.page import PAGE
 from twin.diagnosis.report import write_report
 from twin.diagnosis.retelling import templates
 from twin.fleet.report_page import write_page as write_fleet
@@ -25,6 +30,9 @@ from twin.signals import TICK
 
 PAGES = ("good", "usable", "refused", "fleet", "report")
 WIDTHS = (390, 820, 1400)
+Scheme = Literal["light", "dark"]
+SCHEMES: tuple[Scheme, ...] = ("light", "dark")
+GROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 18, 18)"}
 
 
 def page_of(name: str, code: str, folder: Path) -> Path:
@@ -114,19 +122,97 @@ def test_stored_sentences_of_these_pages_have_templates(
 
 
 @pytest.mark.needs("axe")
+@pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("code", ["en", "de"])
 def test_axe_finds_no_violation_and_no_width_is_too_small(
-    code: str, tmp_path: Path, browser: Browser
+    code: str, scheme: Scheme, tmp_path: Path, browser: Browser
 ) -> None:
     for name in PAGES:
         url = page_of(name, code, tmp_path).as_uri()
         for width in WIDTHS:
-            page = browser.new_page(viewport={"width": width, "height": 800})
+            at = name, width
+            size: ViewportSize = {"width": width, "height": 800}
+            page = browser.new_page(viewport=size, color_scheme=scheme)
             page.goto(url)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width, (name, width)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, at
             scrolled = page.evaluate(
-                "[...document.querySelectorAll('.wide')].some(e => e.scrollWidth > e.clientWidth)"
+                "[...document.querySelectorAll('.wide, figure')]"
+                ".some(e => e.scrollWidth > e.clientWidth)"
             )
-            assert not scrolled, (name, width)
-            assert violations(page) == [], (name, width)
+            assert not scrolled, at
+            assert (
+                page.evaluate("getComputedStyle(document.body).backgroundColor") == (GROUND[scheme])
+            )
+            assert violations(page) == [], at
             page.close()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_each_picture_is_shown_once_with_letters_that_can_be_read(
+    width: int, tmp_path: Path, browser: Browser
+) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 800})
+    page.goto(page_of("report", "en", tmp_path).as_uri())
+    shown = page.evaluate(
+        """[...document.querySelectorAll("figure")].map((figure) =>
+          [...figure.querySelectorAll("svg")].map((svg) =>
+            svg.getBoundingClientRect().width / svg.viewBox.baseVal.width).filter(Boolean))"""
+    )
+    page.close()
+    assert [len(scales) for scales in shown] == [1, 1, 1, 1]
+    letters = [drawing.STYLE["font.size"] * scale for (scale,) in shown]
+    assert 10.0 <= min(letters) <= max(letters) <= 16.0  # pixels
+
+
+def contrast(one: tuple[int, ...], other: tuple[int, ...]) -> float:
+    """The contrast of two colours (WCAG 2.2), from 1 to 21."""
+
+    def luminance(colour: tuple[int, ...]) -> float:
+        shares = [value / 255.0 for value in colour[:3]]
+        linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+        return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+
+    dark, light = sorted((luminance(one), luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_lines_and_letters_of_pictures_stand_out_in_both_schemes(browser: Browser) -> None:
+    """WCAG asks for 3 of lines and marks, 4.5 of letters; white becomes the page's ground."""
+    lines = [drawing.MEASURED, drawing.BEFORE, drawing.AFTER, drawing.QUIET, *drawing.EACH]
+    letters, blank = "#000000", "#ffffff"
+    colours = [*lines, letters, blank]
+    squares = "".join(
+        f'<rect x="{10 * number}" width="10" height="10" fill="{colour}"/>'
+        for number, colour in enumerate(colours)
+    )
+    svg = f'<svg viewBox="0 0 {10 * len(colours)} 10">{squares}</svg>'
+    empty = dict.fromkeys(("title", "colour", "mark", "verdict", "headline", "footer"), "")
+    html = PAGE.substitute(empty, language="en", body=svg)
+    for scheme in SCHEMES:
+        page = browser.new_page(viewport={"width": 600, "height": 400}, color_scheme=scheme)
+        page.set_content(html)
+        box = page.locator("svg").bounding_box()
+        image = Image.open(io.BytesIO(page.screenshot()))
+        page.close()
+        assert box is not None
+        ground = image.getpixel((300, 399))
+        assert isinstance(ground, tuple)
+        middle, step = box["y"] + box["height"] / 2.0, box["width"] / len(colours)
+        for number, colour in enumerate(colours):
+            pixel = image.getpixel((round(box["x"] + (number + 0.5) * step), round(middle)))
+            assert isinstance(pixel, tuple)
+            least = 4.5 if colour == letters else 3.0
+            if colour == blank:
+                assert pixel == ground, scheme
+            else:
+                assert contrast(pixel, ground) >= least, (colour, scheme)
+
+
+def test_paper_is_white_and_wide(tmp_path: Path, browser: Browser) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark")
+    page.goto(page_of("report", "en", tmp_path).as_uri())
+    page.emulate_media(media="print", color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == GROUND["light"]
+    assert page.locator(".on-screen").first.is_visible()
+    assert not page.locator(".on-phone").first.is_visible()
+    page.close()

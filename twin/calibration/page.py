@@ -11,7 +11,6 @@ from twin.calibration.report import calibration_headline, headline, parameters, 
 from twin.calibration.verdict import Verdict
 from twin.config import Asset
 from twin.diagnosis import page
-from twin.diagnosis.drawing import as_svg
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import capital, listed, spoken
 from twin.files import write_text
@@ -123,7 +122,7 @@ def _picture(commissioned: Commissioned) -> str:
     title = tr("Measured against fitted: {result}", result=_result(commissioned.verdict))
     picture = draw_fit(commissioned.calibration.fitted.data, commissioned.samples)
     caption = tr("The cycle whose deviation is the median of all.")
-    return page.picture(title, as_svg(picture), caption)
+    return page.picture(title, picture, caption)
 
 
 def _result(verdict: Verdict) -> str:

@@ -60,7 +60,7 @@ def draw_curves(
         if measured is not None:
             below.plot(time, curve.vacuum - measured, style, color=colour, lw=1.4)
     above.set_ylabel(tr("vacuum\n(mbar below ambient)"))
-    _shade({above, below}, above, time, phase)
+    _shade(picture, {above, below}, above, time, phase)
     legend(picture, [above])
     return below
 
@@ -83,7 +83,13 @@ def outline(curves: Sequence[Floats], columns: int = COLUMNS) -> Ints:
     return np.unique(np.concatenate(rows))
 
 
-def _shade(panels: set[Axes], labelled: Axes, time: Floats, phase: npt.NDArray[np.uint8]) -> None:
+def _shade(
+    picture: Picture,
+    panels: set[Axes],
+    labelled: Axes,
+    time: Floats,
+    phase: npt.NDArray[np.uint8],
+) -> None:
     """Shade the phases, and label those that are wide enough."""
     labelled.set_xlim(time[0], time[-1])
     edges = [0, *(np.flatnonzero(np.diff(phase)) + 1), len(phase) - 1]
@@ -95,5 +101,4 @@ def _shade(panels: set[Axes], labelled: Axes, time: Floats, phase: npt.NDArray[n
             axes.axvspan(begin, end, color=SHADES[name], lw=0, zorder=0)
         if end - begin > LABELLED * (time[-1] - time[0]):
             middle = (begin + end) / 2.0
-            transform = labelled.get_xaxis_transform()
-            labelled.text(middle, 1.02, spoken(name.name.lower()), transform=transform, ha="center")
+            picture.name_above(labelled, middle, spoken(name.name.lower()))

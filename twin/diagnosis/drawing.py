@@ -14,12 +14,16 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, ScalarFormatter
 
 from twin.files import require_ending, said_plainly
 from twin.languages.texts import notation, numeral
 
 WIDTH = 9.6  # inches
+NARROW, TALLER = 4.6, 1.15  # inches on a phone, where more of the height goes into the legend
+PANEL = 0.8  # share of a narrow picture's width that a panel has
+ABOVE, LINE = 3.0, 12.0  # points between a panel and a name above it, and from line to line
 LETTER, HANDLE = 0.075, 0.6  # inches of a letter, and of the mark of a name, in a legend
 MEASURED, BEFORE, AFTER, QUIET = "#1a1a1a", "#c8500a", "#0a62a8", "#8a8a8a"
 EACH = ("#0a62a8", "#8a3d9e", "#2e7d4f")  # a colour for each cause
@@ -50,6 +54,30 @@ class Picture(Figure):
     def __init__(self, name: str, size: tuple[float, float], alt: str) -> None:
         super().__init__(figsize=size, layout="constrained")
         self.name, self.alt = name, alt
+        self.named: list[Axes] = []  # whose lines the legend names
+        self._above: list[tuple[Axes, Annotation]] = []  # names above panels, from left to right
+
+    def name_above(self, axes: Axes, x: float, name: str) -> None:
+        """Write a name above a panel at ``x``; where names would touch, one stands higher."""
+        place, offset = axes.get_xaxis_transform(), "offset points"
+        text = axes.annotate(name, (x, 1.0), (0.0, ABOVE), place, offset, ha="center")
+        self._above.append((axes, text))
+
+    def resize(self, width: float, height: float) -> None:
+        """Make it larger or smaller (inches), with letters as they are."""
+        self.set_size_inches(width, height)
+        if self.named:
+            self.legends[0].remove()
+            with _style(self.name):
+                legend(self, self.named)
+        end = -np.inf  # of the last name on the lower line, inches
+        for axes, name in self._above:
+            low, high = axes.get_xlim()
+            middle = PANEL * width * (name.xy[0] - low) / (high - low)
+            half = len(name.get_text()) * LETTER / 2.0
+            touches = middle - half < end
+            name.set_position((0.0, ABOVE + LINE if touches else ABOVE))
+            end = end if touches else middle + half
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Matplotlib's method, in the style of the picture: ticks are made only now."""
@@ -101,6 +129,17 @@ def as_svg(picture: Picture) -> str:
     return svg.replace("<svg", f'<svg role="img" aria-label="{html.escape(picture.alt)}"', 1)
 
 
+def as_narrow_svg(picture: Picture) -> str:
+    """The same for a phone, with letters of the same size; ``picture`` is as before afterwards."""
+    name, width, height = picture.name, *picture.get_size_inches()
+    picture.name = f"{name}-narrow"
+    picture.resize(NARROW, TALLER * height)
+    svg = as_svg(picture)
+    picture.name = name
+    picture.resize(width, height)
+    return svg
+
+
 def write_picture(picture: Picture, path: Path) -> None:
     """Write a picture, SVG or PNG as ``path`` ends.
 
@@ -111,10 +150,11 @@ def write_picture(picture: Picture, path: Path) -> None:
         picture.savefig(path, metadata=FORMATS[path.suffix.lower()], dpi=110)
 
 
-def legend(figure: Figure, panels: Iterable[Axes]) -> None:
+def legend(figure: Picture, panels: Iterable[Axes]) -> None:
     """One legend above all panels, each name once."""
     named: dict[str, Artist] = {}
-    for axes in panels:
+    figure.named = list(panels)
+    for axes in figure.named:
         handles, labels = axes.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
     columns = legend_columns(list(named), figure.get_figwidth())

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Sequence
 from string import Template
 
-from twin.diagnosis.drawing import FORMATS, Picture
+from twin.diagnosis.drawing import FORMATS, Picture, as_narrow_svg, as_svg
 
 PAGE = Template("""<!DOCTYPE html>
 <html lang="$language">
@@ -19,34 +19,47 @@ PAGE = Template("""<!DOCTYPE html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>$title</title>
 <style>
-:root { color-scheme: light; }
+:root { color-scheme: light; --ink: #1a1a1a; --ground: #fff; --dim: #444; --line: #ccc;
+  --rule: #888; --box: #f3f6fa; --blue: #0a62a8; }
+/* On paper it stays light. Pictures keep their hues; their white becomes the ground. */
+@media screen and (prefers-color-scheme: dark) {
+  :root { color-scheme: dark; --ink: #ececec; --ground: #121212; --dim: #b8b8b8; --line: #4a4a4a;
+    --rule: #8a8a8a; --box: #1b242e; --blue: #62b0ff; }
+  svg { filter: invert(.93) hue-rotate(180deg); }
+}
 body { font: 16px/1.45 system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif;
-  color: #1a1a1a; background: #fff; max-width: 60rem; margin: 1.5rem auto; padding: 0 1rem; }
+  color: var(--ink); background: var(--ground); max-width: 60rem; margin: 1.5rem auto;
+  padding: 0 1rem; }
 .banner { background: $colour; color: #fff; border-radius: .4rem; padding: .8rem 1.2rem;
   print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 .banner p { margin: 0; font-weight: 600; letter-spacing: .03em; }
 .banner h1 { margin: .2rem 0 0; font-size: 1.35rem; line-height: 1.3; }
 h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
 h3 { font-size: 1rem; margin: 0 0 .3rem; }
-article, aside { border: 1px solid #ccc; border-left: .3rem solid $colour; border-radius: .3rem;
-  padding: .7rem 1rem; margin: .8rem 0; }
-aside { background: #f3f6fa; border-left-color: #0a62a8;
+article, aside { border: 1px solid var(--line); border-left: .3rem solid $colour;
+  border-radius: .3rem; padding: .7rem 1rem; margin: .8rem 0; }
+aside { background: var(--box); border-left-color: var(--blue);
   print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 article p, aside p { margin: 0; }
 article dl { margin: .5rem 0 0; grid-template-columns: 7.5rem 1fr; }
-figure { margin: 0; overflow-x: auto; }
-svg { width: 100%; min-width: 36rem; height: auto; }
-figcaption, footer { color: #444; font-size: .88rem; }
-footer { border-top: 1px solid #ccc; margin-top: 2rem; }
+figure { margin: 0; }
+svg { width: 100%; height: auto; }
+.on-phone { display: none; }
+@media screen and (max-width: 44rem) {
+  .on-screen { display: none; }
+  .on-phone { display: block; max-width: 34rem; }
+}
+figcaption, footer { color: var(--dim); font-size: .88rem; }
+footer { border-top: 1px solid var(--line); margin-top: 2rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; margin: .3rem 0 1.4rem; min-width: 50%; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
-th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px solid #ddd;
+th, td { text-align: left; padding: .25rem 1.6rem .25rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; hyphens: auto; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.6rem; }
-dt { color: #444; }
+dt { color: var(--dim); }
 dd { margin: 0; overflow-wrap: anywhere; }
-thead :is(th, td) { border-bottom: 2px solid #888; font-weight: 600; }
+thead :is(th, td) { border-bottom: 2px solid var(--rule); font-weight: 600; }
 tbody th { font-weight: 400; white-space: nowrap; }
 td { min-width: 2.5rem; }
 td:nth-child(2) { min-width: 7rem; }
@@ -63,18 +76,18 @@ td:nth-child(2) { min-width: 7rem; }
   .many, .many :is(caption, tbody, tr, th, td) { display: block; }
   .many { width: 100%; margin-bottom: .8rem; }
   .many thead { display: none; }
-  .many tr { border-bottom: 1px solid #888; padding: .4rem 0; }
+  .many tr { border-bottom: 1px solid var(--rule); padding: .4rem 0; }
   .many :is(td, tbody th) { border: 0; padding: .1rem 0; max-width: none; text-align: left; }
   .many tbody th { font-weight: 600; }
   .many td[data-head] { display: grid; grid-template-columns: 9rem 1fr; gap: .8rem; }
-  .many td[data-head]::before { content: attr(data-head); color: #444; }
+  .many td[data-head]::before { content: attr(data-head); color: var(--dim); }
   .many td:empty { display: none; }
 }
 figure, table, article, aside { break-inside: avoid; }
 h2, h3 { break-after: avoid; }
 @media print {
   body { margin: 0; max-width: none; padding: 0; font-size: 10.5pt; }
-  svg { min-width: 0; max-height: 8.8cm; }
+  svg { max-height: 8.8cm; }
   section { break-inside: avoid; }
 }
 </style>
@@ -142,10 +155,12 @@ def section(title: str, body: str) -> str:
     return f"<section><h2>{html.escape(title)}</h2>\n{body}\n</section>"
 
 
-def picture(title: str, svg: str, caption: str) -> str:
-    """A picture under a heading that states the conclusion."""
+def picture(title: str, drawn: Picture, caption: str) -> str:
+    """A picture under a heading that states the conclusion, drawn for screen and for phone."""
+    wide = f'<div class="on-screen">{as_svg(drawn)}</div>'
+    narrow = f'<div class="on-phone">{as_narrow_svg(drawn)}</div>'
     caption = f"<figcaption>{html.escape(caption)}</figcaption>"
-    return section(title, f'<figure tabindex="0">{svg}{caption}</figure>')
+    return section(title, f"<figure>{wide}{narrow}{caption}</figure>")
 
 
 def card(title: str, sentence: str, rows: Iterable[tuple[str, str]]) -> str:

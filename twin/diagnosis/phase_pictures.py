@@ -205,10 +205,10 @@ def draw_left(diagnosed: Found, laid: Laid, alt: str) -> Picture:
             axes.axhline(0.0, color=QUIET, lw=0.8)
             shown_terms = [term for term in diagnosed.terms if KINDS.index(term.where) in kinds]
             _terms(axes, [term for term in shown_terms if term.over == over])
-        panels[0].set_xlabel(tr("time since the phase began (ms)"))
+        panels[0].set_xlabel(tr("time since\nthe phase began (ms)"))
         logarithmic(panels[0])
         panels[0].set_ylabel(tr(DEVIATION))
-        panels[1].set_xlabel(tr("vacuum (mbar below ambient)"))
+        panels[1].set_xlabel(tr("vacuum\n(mbar below ambient)"))
         legend(figure, panels)
         return figure
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from twin.monitor.bins import Ints
 from twin.signals import MBAR, MS, NS
 
 POINTS = 1000  # of a line; more do not show
+LONGEST = 32  # letters in a line of a name, which leave a phone as much for the axis
 MOST_RANKED = 12
 WIDE, NARROW = (1.0, 2.0, 3.0, 5.0), (1.0, 1.1, 1.2, 1.3, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0)  # labels
 
@@ -133,7 +135,9 @@ def draw_ranking(diagnosed: Found, alt: str) -> Picture:
     """Draw the residual of each fitted hypothesis on the fitted cycles, the best on top."""
     rows = _ranked(diagnosed)
     names, leftovers, colours = zip(*reversed(rows), strict=True)
-    with empty("ranking", 1.0 + 0.27 * len(rows), alt) as figure:
+    names = tuple(fill(name, LONGEST) for name in names)
+    lines = 1 + max(name.count("\n") for name in names)
+    with empty("ranking", 1.2 + (0.13 + 0.14 * lines) * len(rows), alt) as figure:
         axes = figure.subplots()
         positions = np.arange(len(rows))
         axes.hlines(positions, 1.0, leftovers, color=PALE, lw=1.0)
@@ -146,7 +150,8 @@ def draw_ranking(diagnosed: Found, alt: str) -> Picture:
         logarithmic(axes, WIDE if max(leftovers) > 3.0 * min(1.0, *leftovers) else NARROW)
         axes.axvline(1.0, color=MEASURED, lw=1.2, ls="--")
         axes.text(1.0, 1.01, tr("healthy"), transform=axes.get_xaxis_transform(), ha="center")
-        axes.set_xlabel(tr("leftover on the fitted cycles (sigma of what healthy cycles scatter)"))
+        text = tr("leftover on the fitted cycles\n(sigma of what healthy cycles scatter)")
+        figure.supxlabel(text, fontsize=10)
         axes.margins(x=0.1)
         axes.set_ylim(-0.6, len(rows) - 0.3)
         return figure

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from twin.diagnosis import page
 from twin.diagnosis.answer import Diagnosis
-from twin.diagnosis.drawing import Picture, as_svg
+from twin.diagnosis.drawing import Picture
 from twin.diagnosis.log_picture import draw_log
 from twin.diagnosis.phase_pictures import (
     Laid,
@@ -116,7 +116,7 @@ def _page(diagnosis: Diagnosis) -> str:
     else:
         diagnosed = Found.of(diagnosis)
         shown = [PICTURES[name](diagnosed, times) for name in _of_verdict(answer)]
-        parts += [page.picture(s.title, as_svg(s.picture), s.caption) for s in shown]
+        parts += [page.picture(s.title, s.picture, s.caption) for s in shown]
         parts.append(page.section(tr("Numbers"), "\n".join(_tables(answer, times))))
     return page.PAGE.substitute(
         language=language_code(),

@@ -13,11 +13,12 @@ _PAGE = """<!DOCTYPE html>
 <meta charset="utf-8">
 <title>{title}</title>
 <style>
+:root {{ color-scheme: light dark; }}
 body {{ font: 16px/1.45 system-ui, "DejaVu Sans", Arial, sans-serif; max-width: 60rem;
-  margin: 1.5rem auto; padding: 0 1rem; color: #1a1a1a; background: #fff; }}
+  margin: 1.5rem auto; padding: 0 1rem; }}
 table {{ border-collapse: collapse; }}
 th, td {{ text-align: left; vertical-align: top; padding: .25rem 1.2rem .25rem 0;
-  border-bottom: 1px solid #ddd; }}
+  border-bottom: 1px solid #888; }}
 code {{ white-space: nowrap; }}
 </style>
 </head>

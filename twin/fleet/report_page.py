@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.ticker import FuncFormatter
 
-from twin.diagnosis.drawing import AFTER, BEFORE, QUIET, as_svg, empty, legend, logarithmic
+from twin.diagnosis.drawing import AFTER, BEFORE, QUIET, empty, legend, logarithmic
 from twin.diagnosis.page import PAGE, english_card, paragraph, picture, section, table
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import spoken
@@ -292,13 +292,12 @@ def _distance_picture(report: Report) -> list[str]:
         axes.set_xlabel(tr("rank"))
         axes.set_ylabel(tr("furthest from the others\n(sigmas of their scatter)"))
         legend(figure, [axes])
-        svg = as_svg(figure)
     caption = tr(
         "Each unit by the effect in which it is furthest from the others of its type. The dashed"
         " line is at {sigmas} sigma; a unit below it may stand out by its drift.",
         sigmas=numeral(STANDS_OUT, "g"),
     )
-    return [picture(title, svg, caption)]
+    return [picture(title, figure, caption)]
 
 
 def _columns(rows: Iterable[Sequence[str]]) -> list[str]:
