@@ -244,6 +244,45 @@ def test_a_break_is_no_knee(flag: Quality) -> None:
     assert (phase == Phase.HOLD).any()
 
 
+def two_suctions(falls_for: int, goes_on: int) -> tuple[Samples, int]:
+    """Two suctions, and the first row after the second one.
+
+    In the first one the nozzle goes off after 200 rows, and the knee shows. In the second one the
+    pressure falls for ``falls_for`` rows, and suction ends ``goes_on`` rows later.
+    """
+    fall, idle = 1e5 - 300.0 * np.arange(max(falls_for, 200)), np.full(60, 1e5)
+    rise = 10.0 * np.arange(1, 301)
+    first = np.concatenate([fall[:200], fall[199] + rise])
+    second = np.concatenate([fall[:falls_for], fall[falls_for - 1] + rise[:goes_on]])
+    pieces = ((idle, 0), (first, 1), (idle, 2), (idle, 0), (second, 1), (idle, 2), (idle, 0))
+    commands = np.concatenate([np.full(len(piece), command) for piece, command in pieces])
+    pressure = np.concatenate([piece for piece, _ in pieces])
+    pressure += KNEES.noise * np.random.default_rng(goes_on).standard_normal(len(pressure))
+    return stream(commands, pressure), len(commands) - 2 * len(idle)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+@pytest.mark.parametrize("goes_on", [2, 5, 8])
+def test_where_suction_ends_before_the_knee_shows_the_level_of_the_last_one_decides(
+    goes_on: int, block: int
+) -> None:
+    samples, end = two_suctions(200, goes_on)
+    knees = replace(KNEES, off_shift=8)
+    _, phase, level = find(samples, knees, block)
+    acted = end - goes_on - knees.off_shift
+    assert (phase[acted - 60 : acted - 3] == Phase.SUCTION).all()
+    assert (phase[acted + 3 : end] == Phase.HOLD).all()
+    assert (phase[end : end + 60] == Phase.BLOW_OFF).all()
+    assert np.isfinite(level[61:end]).sum() == 2  # the knee of the first one, and the idle before
+
+
+@pytest.mark.parametrize("block", [1, 1000])
+def test_a_pressure_below_that_level_for_long_without_a_knee_says_nothing(block: int) -> None:
+    samples, end = two_suctions(260, 0)
+    _, phase, _ = find(samples, replace(KNEES, off_shift=8), block)
+    assert (phase[end - 260 : end] == Phase.SUCTION).all()
+
+
 def test_a_jump_is_no_knee() -> None:
     samples = stream([1] * 600, 1e5 - 100.0 * np.arange(600))
     samples["pressure"][300:] += 2500.0

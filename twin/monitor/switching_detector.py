@@ -6,6 +6,9 @@ straight line on each side, so it lags behind the measurement where there may be
 steps only over rows whose phase is known, and is synchronised to the measured level at each knee.
 Rows that cannot be at a knee are given out at once.
 
+If suction ends too soon after a switching, its knee does not show. Then the level decides: the
+nozzle went off where the pressure fell below that at which it went off before.
+
 If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
 pressure does not show a reported switching, it is placed where the valve must have acted.
 """
@@ -21,7 +24,7 @@ from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
 from twin.model.control import effective_commands, new_timer
 from twin.quality import BREAK, UNUSABLE
-from twin.signals import MS, NS, SAMPLE, Phase, Reported, Samples, joined
+from twin.signals import MBAR, MS, NS, SAMPLE, Phase, Reported, Samples, joined
 
 _Floats = npt.NDArray[np.float64]
 _Bytes = npt.NDArray[np.uint8]
@@ -31,6 +34,7 @@ FEWEST_IDLE_ROWS = 5
 SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
 JUMP = 8.0  # times the noise, from one row to the next: a larger change is no knee
 ALONE = 2.0  # a jump over the changes before and after it: a ringing line rises for longer
+BEYOND = 10.0 * MBAR  # Pa below a known level of switching; in a record it scatters by 2 mbar rms
 SHORTEST_WINDOW = 8  # rows
 MOST_MISSING = 0.5  # of a line's rows
 
@@ -42,7 +46,8 @@ _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
 # In this suction: knees, rows since it began, reported switchings that are overdue, and the nozzle
 # as reported then (1 on, 0 off, -1 not yet).
 _SWITCHED, _SINCE, _REPORTS, _SAID = range(9, 13)
-_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+_OFF_LEVEL = 13  # pressure when the nozzle last went off, in whichever suction; NaN before
+_BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, math.nan)
 _KNOWN, _ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
@@ -229,6 +234,8 @@ def _find(
             _track_break(state, pressure, reported[:end], row, settings, looks, phase, level)
             if reported[row] & _KNOWN:
                 _follow_report(state, pressure, reported, row, settings, phase, level)
+            else:
+                _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
     return len(pressure)
 
 
@@ -322,11 +329,43 @@ def _track_break(
         shift = int(settings[2] if nozzle_on else settings[3])
         level[knee] = state[_KNEE_LEVEL] = state[_BEST_LEVEL]
         phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
+        if nozzle_on:
+            state[_OFF_LEVEL] = _level_before(pressure, knee - shift)
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
         state[_SWITCHED] += 1.0
         state[_AGE] = (
             state[_BEST_AGE] + window + settings[4] - settings[5]
         )  # the valve has acted already
+
+
+@per_row
+def _level_before(pressure: _Floats, row: int) -> float:
+    """Pressure (Pa) at ``row`` by a line through the rows up to it."""
+    slope, middle = _line(pressure, max(row - SHORTEST_WINDOW + 1, 0), SHORTEST_WINDOW)
+    return middle + 0.5 * (SHORTEST_WINDOW - 1) * slope
+
+
+@per_row
+def _decide_by_level(
+    state: _Floats, pressure: _Floats, row: int, settings: _Floats, is_last: bool, phase: _Bytes
+) -> None:
+    """At the last row of a suction, let the nozzle go off where a level says so.
+
+    That is where the pressure fell below the one at which it went off before. If that was so long
+    ago that the knee would show, the nozzle did not go off.
+    """
+    fallen = state[_OFF_LEVEL] - pressure[row]
+    least = max(SIGNIFICANT * settings[1], BEYOND)
+    if not is_last or state[_NOZZLE] == 0.0 or not fallen > least:  # or one is NaN
+        return
+    window = int(settings[0])
+    searched = int(state[_AGE] - settings[4]) - window
+    first = max(row - min(window, searched) - int(settings[2]), 0)
+    off = row
+    while off >= first and not pressure[off] > state[_OFF_LEVEL]:
+        off -= 1
+    if off >= first:
+        phase[off + 1 : row + 1] = _HOLD
 
 
 @per_row
@@ -393,8 +432,7 @@ def _follow_report(
         return
     nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
     knee = report_row + int(min(settings[8] if nozzle_on else settings[9], settings[7]))
-    slope, middle = _line(pressure, max(knee - SHORTEST_WINDOW + 1, 0), SHORTEST_WINDOW)
-    level[knee] = state[_KNEE_LEVEL] = middle + 0.5 * (SHORTEST_WINDOW - 1) * slope
+    level[knee] = state[_KNEE_LEVEL] = _level_before(pressure, knee)
     phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
     state[_SWITCHED] += 1.0
