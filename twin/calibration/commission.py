@@ -27,17 +27,19 @@ from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
 from twin.calibration.stationarity import refuse_parted
+from twin.calibration.thresholds import decided
 from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
 from twin.errors import ConfigError
 from twin.languages.texts import numeral, tr
 from twin.model import theta as c
-from twin.model.dataset import Ambient, DataSet, sensor_place
+from twin.model.dataset import Ambient, DataSet, coefficients, sensor_place
 from twin.model.effects import standing_for
 from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
-from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
+from twin.monitor.cycles import Cycle
+from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
@@ -64,9 +66,10 @@ NEARLY = 0.95  # first guess of the end pressure, over the deepest pressure with
 RIGID, LIPS, BELLOWS = (0.0, 5.0, 30.0), (0.03, 5.0, 30.0), (0.4, 10.0, 300.0)
 # Growth time of suction (s) for which the jet is tried as the cause; its shortest response (ms).
 SLOW_JET, SOONEST_MS = (12.0 * MS, 100.0 * MS), 2.0
+_THRESHOLDS = ("h1_mbar", "h1_hysteresis_mbar", "h2_mbar")
 _JET = ("ramp_up_ms", "ramp_down_ms", "response_ms", "response_off_ms")
 SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # first guess of the supply
-CLEARLY = 15.0  # mbar: a threshold is reported if it differs by more; a turn includes overshoot
+CLEARLY = 15.0  # mbar: a threshold is reported if it differs by more
 # A sensor is reported as misplaced beyond this share of the line, and beyond so many sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
 # A record that rises so far above ambient (mbar) has met a relief valve, which opens at about half
@@ -146,7 +149,7 @@ def commission(
     unseen_level = _unseen_level(config.data, readings)
     config = replace(config, data=taken_in(config.data, samples))
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
-    guess, remarks = guessed(config.data, readings)
+    guess, _ = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before, "commissioning")
     switching_data = switching(guess, samples)
@@ -165,8 +168,7 @@ def commission(
     if "flow" not in wrong_signals:
         metered, by_flow = as_metered(config.data, readings)
     if "nozzle" in wrong_signals or by_flow:
-        guess, remarks = guessed(metered, readings)
-        remarks = by_flow + remarks
+        guess, _ = guessed(metered, readings)
         before = complete(guess, samples)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
@@ -174,23 +176,35 @@ def commission(
     free = free_of(config, readings)
     guesses = starts(guess, readings.meets, readings.grows, _into_hose(guess, readings))
     fitted = _fit(used, guesses, free, progress)
-    if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
-        remarks = by_flow + guessed(within(metered, fitted.data.ambient), readings)[1]
     progress("judging the fit")
-    verdict = judge(Cycles.found(samples, fitted.data), fitted.data, readings.noise)
+    found_cycles = Cycles.found(samples, fitted.data)
+    verdict = judge(found_cycles, fitted.data, readings.noise)
+    if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
+        metered = within(metered, fitted.data.ambient)
+    fitted, remarks = _deciding(fitted, found_cycles, metered, readings)
+    remarks = by_flow + remarks
     if verdict.word != "refused":  # the places of a bad fit mean nothing
         remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)
-    fitted_config = replace(config, data=fitted.data)
-    sigma = OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
-    untold = {} if optimum_is_told else {"supply.optimum_bar": sigma}
-    healthy = like_these(fitted_config, fitted, scatter(fitted.data, cycles), samples, untold)
+    sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
+    healthy = _healthy(replace(config, data=fitted.data), fitted, cycles, samples, sigma)
     healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
     return Commissioned(
         calibration, readings, verdict, tuple(remarks), tuple(contradictory), samples
     )
+
+
+def _healthy(
+    config: Config, fitted: Fitted, cycles: Sequence[Cycle], samples: Samples, optimum: float
+) -> Healthy:
+    """The healthy scatter of ``cycles``; ``optimum`` (bar) is the sigma of the optimum pressure.
+
+    It is 0 if it is configured.
+    """
+    untold = {"supply.optimum_bar": optimum} if optimum else {}
+    return like_these(config, fitted, scatter(fitted.data, cycles), samples, untold)
 
 
 def _unseen_level(data: DataSet, readings: Readings) -> float:
@@ -253,6 +267,26 @@ def _fit(
             " [data.system] lists, or of more than one unit",
             "check volumes, tubes and the sensor's place; commission on a record of one unit",
         ) from error
+
+
+def _deciding(
+    fitted: Fitted, cycles: Cycles, configured: DataSet, readings: Readings
+) -> tuple[Fitted, list[Remark]]:
+    """The fit with thresholds where the control decides in ``cycles``, and remarks as ``guessed``.
+
+    Until the fit they are where the pressure turns.
+    """
+    if not readings.saves_air:
+        return fitted, guessed(configured, readings)[1]
+    decisions = decided(readings, cycles, coefficients(fitted.data))
+    guess, remarks = guessed(configured, decisions)
+    return replace(fitted, data=switching_as(guess, fitted.data)), remarks
+
+
+def switching_as(guess: DataSet, data: DataSet) -> DataSet:
+    """``data`` with the thresholds of ``guess``."""
+    thresholds = {key: getattr(guess.ejector, key) for key in _THRESHOLDS}
+    return data.model_copy(update={"ejector": data.ejector.model_copy(update=thresholds)})
 
 
 def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:

@@ -25,6 +25,7 @@ MOST_EARLY = 15.0 * MS  # s (a row at least), by which the nozzle may be seen ea
 # Sigmas of a second sensor beside the first: offset of 1 % of a vacuum sensor's bar, error of its
 # span, and the error of its lag, which is one of LAGS.
 ZERO, SPAN, LAG = 10.0 * MBAR, 0.01, 1.0 * MS  # Pa, 1, s
+NO_LAG = 0.25 * MS  # s, stage of a sensor without an input filter: a data set has none faster
 LAGS = np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0]) * MS
 Bytes = npt.NDArray[np.uint8]
 
@@ -91,9 +92,48 @@ class Cycles:
         return cls(rows, dt, phase, level, bins, measured, drawn, tolerance, unsure=unsure)
 
     @property
+    def period(self) -> float:
+        """Median time (s) from row to row."""
+        return float(np.median(self.dt))
+
+    @property
     def most_early(self) -> int:
         """Rows by which a switching may be seen early or late, the same in all cycles."""
-        return max(round(MOST_EARLY / float(np.median(self.dt))), 1)
+        return max(round(MOST_EARLY / self.period), 1)
+
+    @property
+    def switchings(self) -> tuple[Ints, npt.NDArray[np.bool_]]:
+        """Rows at which the nozzle is seen to switch, and whether it goes on."""
+        rows = _switches(self.phase)
+        return rows, self.phase[rows] == Phase.SUCTION
+
+    def best_early(self, theta: Theta) -> tuple[int, Floats]:
+        """Rows by which the nozzle switches before it is seen to, and the residual (Pa) of bins.
+
+        The pressure shows the switching a little early or late, the same in all cycles. These rows
+        fit ``theta`` best.
+        """
+        early = range(-self.most_early, self.most_early + 1)
+        off = self.off(np.repeat(theta[:, None], len(early), axis=1), early)
+        usable = np.isfinite(off).all(axis=1) & (self.bins.cycle >= 1)
+        mean_square = np.average(off[usable] ** 2, axis=0, weights=self.bins.count[usable])
+        best = int(np.argmin(mean_square))
+        return early[best], off[:, best]
+
+    def control_pressure(self, theta: Theta, early: int) -> Floats:
+        """Pressure (Pa) of each row that the ejector's own control acts on; NaN where unusable.
+
+        If its sensor is not the PLC's, the model of ``theta`` says how they differ.
+        """
+        usable = ((self.samples["quality"] & UNUSABLE) == 0) & np.isfinite(self.samples["pressure"])
+        measured = np.where(usable, self.samples["pressure"].astype(np.float64), np.nan)
+        if theta[c.CONTROL_SENSOR] == c.PLC:
+            return measured
+        own = theta.copy()
+        own[c.PLACE], own[c.SENSOR_LAG], own[c.SLOW_SENSOR] = 0.0, NO_LAG, 0.0
+        both = np.stack([own, theta], axis=1)
+        expected = _expected(both, self.dt, self._phases([early]), self.level)
+        return measured + expected[:, 0] - expected[:, 1]
 
     def of_second(self, end: Literal["port", "vessel"]) -> "Cycles":
         """These cycles with the second pressure, measured at an ``end`` of the line."""

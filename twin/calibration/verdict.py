@@ -12,7 +12,6 @@ import numpy as np
 
 from twin.calibration.cycles import Cycles
 from twin.model.dataset import DataSet, coefficients
-from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
 from twin.signals import MBAR, Phase
 
@@ -64,7 +63,7 @@ class Verdict:
 
 def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     """Judge the twin of ``data`` on ``cycles``; ``noise`` (Pa) is that of one reading."""
-    off = _residual(cycles, coefficients(data))
+    _, off = cycles.best_early(coefficients(data))
     bins = cycles.bins
     places = bins.place_by_turn
     used = (bins.cycle >= 1) & np.isfinite(off)  # the model settles in the first cycle
@@ -87,20 +86,6 @@ def _largest_mean(off: Floats, place: Ints, since: Floats) -> tuple[float, float
     mean = np.bincount(number, off) / counts
     worst = int(np.argmax(np.abs(mean) * (counts >= min(FEWEST, counts.max()))))
     return float(mean[worst]), float(np.median(since[number == worst]))
-
-
-def _residual(cycles: Cycles, theta: Theta) -> Floats:
-    """Residual (Pa) of each bin, with the shift of the nozzle's switching that fits best.
-
-    The pressure shows the switching a little early or late, the same in all cycles. The live twin
-    is synchronised to the pressure there.
-    """
-    early = range(-cycles.most_early, cycles.most_early + 1)
-    off = cycles.off(np.repeat(theta[:, None], len(early), axis=1), early)
-    usable = np.isfinite(off).all(axis=1) & (cycles.bins.cycle >= 1)
-    mean_square = np.average(off[usable] ** 2, axis=0, weights=cycles.bins.count[usable])
-    best: Floats = off[:, int(np.argmin(mean_square))]
-    return best
 
 
 def _phase_of(kind: Ints) -> Ints:
