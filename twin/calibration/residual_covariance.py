@@ -5,6 +5,7 @@ and does not: the fit must be no surer than with the mean cycle alone. So each o
 the error with n times its variance, which is equivalent.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +18,7 @@ from twin.model import theta as c
 from twin.model.effects import standing_for
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints
-from twin.monitor.scatter_covariance import SCATTER
+from twin.monitor.scatter_covariance import SCATTERING
 from twin.signals import MBAR, ML, MS
 
 FIRST_ERROR = 3.0 * MBAR  # Pa, of a model that has not been fitted
@@ -26,6 +27,8 @@ VOLUME = 0.01  # relative sigma of the evacuated volume
 LATE = 0.5 * MS  # s, sigma of the time of an edge in the model
 HIDDEN = 1.5  # model error before a fit, over the residual that the fit leaves of it
 NEAR = 4  # neighbouring bins on either side over which the error's variance is averaged
+TIMES = np.array([parameter.is_time for parameter in SCATTERING.values()])  # among scatter
+LEAST_MORE = 0.1  # cycles beyond one: less than any mean over neighbours that is not zero
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,9 @@ def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
     """
     bins = cycles.bins
     errors = np.hypot(error, late * _slope(cycles))
-    parts = []
-    numbers = np.unique(bins.cycle[bins.cycle >= 1])  # the model settles in the first
-    for number in numbers:
-        rows = np.flatnonzero(bins.cycle == number)
-        covariance = low_rank(cycles.unsure[rows]) * len(numbers)
+    parts, rows_by_cycle = [], _settled(bins)
+    for rows in rows_by_cycle:
+        covariance = low_rank(cycles.unsure[rows]) * len(rows_by_cycle)
         add_independent(covariance, errors[rows] ** 2 + noise**2 / bins.count[rows])
         parts.append((rows, Covariance.of(covariance)))
     return Weights(parts)
@@ -70,29 +71,63 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
     bins = cycles.bins
     more_volume, parameter = standing_for(c.VOLUME)
     volume_change = (more_volume.name, {parameter.name: VOLUME * theta[c.VOLUME] / ML})
-    scatter_changes = [(name, {key: size}) for name, (key, size) in SCATTER.items()]
-    sigmas = [volume_change, *scatter_changes]
+    sigmas = [volume_change, *_scatter_changes(float(np.median(cycles.dt)))]
     off, moves = sensitivities(
         lambda at: cycles.off(coefficients_at(theta, sigmas, at)),
         np.zeros(len(sigmas)),
         np.ones(len(sigmas)),
     )
+    always, scatter = np.column_stack([moves[:, :1], cycles.unsure]), moves[:, 1:]
     errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
     if fitted:
-        errors, cycle_error = _errors(_without_sensor_error(off, cycles.unsure), bins, noise)
+        off = _without_sensor_error(off, cycles.unsure)
+        sizes, timely = _without_times(off, scatter[:, TIMES], bins, noise)
+        scatter[:, TIMES] *= np.maximum(sizes, 1.0)
+        errors, cycle_error = _errors(off, timely, bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
-    numbers = np.unique(bins.cycle[bins.cycle >= 0])
-    always, scatter = np.column_stack([moves[:, :1], cycles.unsure]), moves[:, 1:]
-    parts = []
-    for number in numbers:
-        rows = np.flatnonzero(bins.cycle == number)
+    parts, rows_by_cycle = [], _settled(bins)
+    for rows in rows_by_cycle:
         time = bins.time[rows]
         covariance = fading(errors[rows], time, bins.kind[rows]) + low_rank(always[rows])
-        covariance *= len(numbers)
+        covariance *= len(rows_by_cycle)
         covariance += fading(cycle_error[rows], time, bins.stretch[rows]) + low_rank(scatter[rows])
         add_independent(covariance, noise**2 / bins.count[rows])
         parts.append((rows, Covariance.of(covariance)))
     return Weights(parts)
+
+
+def _settled(bins: Bins) -> list[Ints]:
+    """Bins of each cycle but the first, in which the model settles."""
+    numbers = np.unique(bins.cycle[bins.cycle >= 1])
+    return [np.flatnonzero(bins.cycle == number) for number in numbers]
+
+
+def _scatter_changes(period: float) -> list[tuple[str, dict[str, float]]]:
+    """Each scattering effect with one sigma of its size; rows are ``period`` (s) apart.
+
+    A command is seen at the next row: so a time scatters at least uniformly over a row.
+    """
+    least = period / math.sqrt(12.0) / MS
+    return [
+        (name, {p.name: max(p.healthy_sigma, least) if p.is_time else p.healthy_sigma})
+        for name, p in SCATTERING.items()
+    ]
+
+
+def _without_times(off: Floats, late: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
+    """How much times scatter (rms over cycles, in sigmas), and the residuals (Pa) without that.
+
+    ``late`` are changes (Pa) by one sigma of each time, (bins, times): this is its prior.
+    """
+    sizes, timely = [], off.copy()
+    for rows in _settled(bins):
+        covariance = fading(np.full(len(rows), FIRST_ERROR), bins.time[rows], bins.stretch[rows])
+        add_independent(covariance, noise**2 / bins.count[rows])
+        white = Covariance.of(covariance).white(np.column_stack([off[rows], late[rows]]))
+        information = white[:, 1:].T @ white[:, 1:] + np.eye(late.shape[1])
+        sizes.append(np.linalg.solve(information, white[:, 1:].T @ white[:, 0]))
+        timely[rows] -= late[rows] @ sizes[-1]
+    return np.sqrt(np.mean(np.square(sizes), axis=0)), timely
 
 
 def _without_sensor_error(off: Floats, unsure: Floats) -> Floats:
@@ -107,21 +142,32 @@ def _slope(cycles: Cycles) -> Floats:
     return cycles.bins.mean(np.gradient(pressure) / float(np.median(cycles.dt)))
 
 
-def _errors(off: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
-    """The model's error in each bin (Pa): common to all cycles, and differing between them."""
-    bin_places, place_number, counts = np.unique(
-        bins.place, return_inverse=True, return_counts=True
-    )
-    mean = np.bincount(place_number, off) / counts
-    noise_variance = np.bincount(place_number, noise**2 / bins.count) / counts
-    scatter_variance = (
-        np.bincount(place_number, (off - mean[place_number]) ** 2) / np.maximum(counts - 1, 1)
-        - noise_variance
-    )
-    kinds = bin_places >> 16
-    common = np.maximum(_neighbour_mean(mean**2 - noise_variance / counts, kinds), LEAST_ERROR**2)
-    per_cycle = np.maximum(_neighbour_mean(scatter_variance, kinds), 0.0)
-    return HIDDEN * np.sqrt(common)[place_number], np.sqrt(per_cycle)[place_number]
+def _errors(off: Floats, timely: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
+    """The model's error in each bin (Pa): common to all cycles, and differing between them.
+
+    Cycles that differ have a mean by chance: this is no common error. ``timely`` are the residuals
+    without what the scatter of times explains. It can be far larger than all other differences.
+    """
+    settled = np.concatenate(_settled(bins))
+    places, number, cycles = np.unique(bins.place[settled], return_inverse=True, return_counts=True)
+    kinds, counts = places >> 16, cycles.astype(np.float64)
+    more = np.maximum(_neighbour_mean(counts - 1.0, kinds), LEAST_MORE)
+
+    def sums(values: Floats) -> Floats:
+        return np.bincount(number, values).astype(np.float64)
+
+    def mean_and_variance(residual: Floats) -> tuple[Floats, Floats]:
+        mean = sums(residual) / counts
+        return mean, _neighbour_mean(sums((residual - mean[number]) ** 2), kinds) / more
+
+    mean, variance = mean_and_variance(off[settled])
+    _, timely_variance = mean_and_variance(timely[settled])
+    noise_variance = _neighbour_mean(sums(noise**2 / bins.count[settled]) / counts, kinds)
+    common = np.maximum(_neighbour_mean(mean**2 - variance / counts, kinds), LEAST_ERROR**2)
+    alone = np.maximum(timely_variance - noise_variance, 0.0)
+    errors = np.zeros((2, len(off)))
+    errors[:, settled] = HIDDEN * np.sqrt(common)[number], np.sqrt(alone)[number]
+    return errors[0], errors[1]
 
 
 def _neighbour_mean(values: Floats, kind: Ints) -> Floats:

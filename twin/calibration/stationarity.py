@@ -121,7 +121,7 @@ def _pressure_steps(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step
     off = np.column_stack(
         sensitivities(lambda at: cycles.off(coefficients_at(theta, typical, at)), neutral, steps)
     )
-    white = weighted(cycles, theta, noise, fitted=False).white(off)[1:]  # it settles in the first
+    white = weighted(cycles, theta, noise, fitted=False).white(off)
     for number, (name, parameter) in enumerate(parameters, 1):
         power = np.array([effect[:, number] @ effect[:, number] for effect in white])
         if power.min() < 1.0:  # a typical size would be no more than noise
