@@ -601,7 +601,8 @@ def test_the_page_has_the_tables_and_every_key() -> None:
     given = FigureSettings.model_validate(keys)
     assert "\n# password = " in example  # without a user in the URL there is none
     assert "\n# price_per_m3 = " in example  # of two prices one is set
-    assert {*keys, "password", "price_per_m3"} == set(FigureSettings.model_fields)
+    assert "\n# keep_days = " in example  # by default all are kept
+    assert {*keys, "password", "price_per_m3", "keep_days"} == set(FigureSettings.model_fields)
     found = limits(given, DATA, MonitorSettings())
     assert (found.t1, found.leakage, found.free_flow) == (2000.0, LIMITS.leakage, LIMITS.free_flow)
     assert found.supply == pytest.approx(LIMITS.supply)  # the defaults, as the page says
