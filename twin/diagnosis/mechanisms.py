@@ -136,12 +136,16 @@ def _displaces(
     """Whether a mechanism leaves so much less than the causes that they only mimic it.
 
     Compared in mbar; if the causes leave no more mbar than healthy cycles have, also in likelihood.
+    One mechanism replaces several causes as well if it leaves less and is likelier.
     """
     weights, mechanism = covariance(evidence, both_ways=False).of(fitted), single.fitted.hypothesis
     before, after = _squares(evidence, weights, causes, mechanism)
+    most = HALF * before
     if before > weights.usual**2:
-        return _left_in_mbar(evidence, weights, causes, mechanism) < DISPLACES
-    return after < HALF * before and _unlikely(evidence, fitted, mechanism) + LIKELIER < _unlikely(
+        if _left_in_mbar(evidence, weights, causes, mechanism) < DISPLACES:
+            return True
+        most = before if len(causes) > 1 else 0.0
+    return after < most and _unlikely(evidence, fitted, mechanism) + LIKELIER < _unlikely(
         evidence, fitted, causes
     )
 

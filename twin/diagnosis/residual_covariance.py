@@ -84,11 +84,11 @@ class Covariance:
         rows = np.flatnonzero(np.isin(bins.cycle, cycles))
         common, alone = model_error(evidence.healthy.error, bins.kind[rows], bins.time[rows])
         scatter = self.moves[rows] * float(scattered)
-        # Healthy cycles have shown how wide this is, but for what another day brings.
+        # Healthy cycles have shown how wide this is, but for what is new in this log.
         learned = evidence.healthy.leftover
         unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
         unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
-        mismatches = [learned * self.mismatch[rows], self.day_mismatch[rows]]
+        mismatches = [self.mismatch[rows], self.day_mismatch[rows]]
         groups = [
             self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle])
             for of_cycle in _runs(bins.cycle[rows])
