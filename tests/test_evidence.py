@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import rigs
 
-from twin.diagnosis.evidence import collect, read_cycles, thinned
+from twin.diagnosis.evidence import HEALTHY, collect, read_cycles, thinned
+from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
+from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.monitor.cycles import whole
 from twin.signals import Samples
@@ -32,6 +34,28 @@ def test_a_value_that_is_open_by_more_than_itself_keeps_to_its_bounds() -> None:
     up, down, _ = evidence.uncertain[-1]
     assert up[c.RELIEF] == pytest.approx(4.0 * healthy_relief)
     assert 0.0 < down[c.RELIEF] < healthy_relief
+
+
+def test_what_a_record_ties_together_moves_healthy_cycles_by_its_slope() -> None:
+    """A whole sigma of it bends away; what moves one value alone keeps its whole sigma."""
+    samples, _ = rigs.recorded("test_rig", 12.0)
+    evidence = collect(rigs.config("test_rig"), [samples])
+    tied = np.array([shift.tied for shift in evidence.uncertain])
+    assert 0 < tied.sum() < len(tied)
+    healthy = covariance(evidence)
+    first = healthy.beyond[:, : len(tied)]
+    assert np.abs(first[:, tied]).max() < 1e-3  # mbar
+    assert (healthy.left_open[:, ~tied] == 0.0).all()
+    bases = [evidence.theta]
+    bases += [evidence.theta + 0.05 * (shift.up - evidence.theta) for shift in evidence.uncertain]
+    off = evidence.off([HEALTHY] * len(bases), bases)
+    slopes = (off[:, 1:] - off[:, :1]) / 0.05
+    for way in np.flatnonzero(tied):
+        apart = np.linalg.norm(healthy.left_open[:, way] - slopes[:, way])
+        assert apart < 0.1 * np.linalg.norm(slopes[:, way])
+    about = covariance(evidence, (Cause("suction_loss", {"loss": 5.0}),))
+    assert (about.left_open == healthy.left_open).all()
+    assert np.abs(about.beyond[:, : len(tied)][:, tied]).max() > 0.1
 
 
 class Reread:

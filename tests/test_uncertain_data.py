@@ -25,6 +25,18 @@ def test_draws_are_as_wide_as_the_shifts_of_one_sigma(name: str) -> None:
         assert ratio == pytest.approx(1.0, abs=0.12), coefficient
 
 
+def test_a_way_that_moves_other_values_by_much_ties_them() -> None:
+    data = rigs.config("test_rig").data
+    rows = {
+        "ejector.suction_capacity_sl_min": (1.0,),
+        "ejector.end_pressure_mbar": (0.9, 0.1),  # known only together with the suction
+        "ejector.response_ms": (0.001, 0.002, 0.5),  # stands alone
+    }
+    shifts = list(shifted(data, Healthy(uncertain=rows)))
+    assert [shift.tied for shift in shifts[-3:]] == [True, False, False]
+    assert not any(shift.tied for shift in shifts[:-3])  # of the supply
+
+
 def test_cycles_scatter_either_way_and_no_flow_gets_negative() -> None:
     theta = rigs.theta("gripper")
     healthy = Healthy(scatter={"leakage": 0.02, "supply_pressure_drop": 0.01})

@@ -197,7 +197,7 @@ class Evidence:
         return deviations
 
     @cached_property
-    def left_open(self) -> "LeftOpen":
+    def left_open(self) -> LeftOpen:
         """What the calibration left open of the twin without causes."""
         ups, downs = ([getattr(shift, side) for shift in self.uncertain] for side in ("up", "down"))
         near = [self.theta + NEARBY * (up - self.theta) for up in ups]
