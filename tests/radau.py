@@ -176,7 +176,8 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
             *pushes,
             yielding,
             *jet_rates(theta, valves.nozzle, drive, jet),
-            (valves.blow - valve) / theta[c.BLOW_OFF_RAMP],
+            (valves.blow - valve)
+            / theta[c.BLOW_OFF_RAMP if valves.blow > valve else c.BLOW_OFF_RAMP_DOWN],
             theta[c.BLOW_OFF_DRAIN]
             * (valve * (1.0 - drained) - theta[c.BLOW_OFF_REFILL] * drained),
             (regulated - supply) / theta[c.SUPPLY_LAG],

@@ -299,6 +299,26 @@ def test_how_long_suction_takes_to_grow_shows_where_that_is_slow_beside_the_fall
     assert found == pytest.approx(grows, rel=0.3) if share > 0.1 else np.isnan(found)
 
 
+@pytest.mark.parametrize(("steady", "shown"), [(True, True), (False, False)])
+def test_when_blow_off_ends_shows_where_it_was_steady(steady: bool, shown: bool) -> None:
+    """The valve closes 24 ms after its command; a vessel that still fills shows no such edge."""
+    rng = np.random.default_rng(31)
+    vacuum = 700.0 * np.exp(-np.arange(174) / (10.0 if steady else 150.0))
+    blow_off = 1015.0 - vacuum
+    idle = blow_off[-1] - 15.0 * (1.0 - np.exp(-np.arange(300) / 4.0)) * steady
+    one = np.zeros(1000, SAMPLE)
+    one["pressure"][:500], one["commands"][:500] = 300.0 * MBAR, Command.SUCTION
+    one["pressure"][500:674] = blow_off * MBAR
+    one["commands"][500:650] = Command.BLOW_OFF
+    one["pressure"][674:974], one["pressure"][974:] = idle * MBAR, idle[-1] * MBAR
+    record = np.tile(one, 4)
+    record["pressure"] += rng.normal(0.0, 0.8 * MBAR, len(record))
+    record["time_ns"] = np.arange(len(record)) * 1_000_000
+    record["sequence"] = np.arange(len(record))
+    ends = read(record).blow_off_ends / MS
+    assert ends == pytest.approx(26.0, abs=2.0) if shown else np.isnan(ends)
+
+
 def test_a_fit_starts_with_a_slow_jet_where_the_fall_grows_slowly() -> None:
     data = config_of(logged(SEED, KIND).truth.readable).data
     plain, slow = starts(data, np.nan), starts(data, np.nan, 25.0 * MS)
@@ -658,6 +678,26 @@ def test_the_interval_of_suction_counts_that_rigs_have_other_equations() -> None
     low, high = replace(fitted, covariance=0.0 * fitted.covariance).interval(name)
     assert (low, high) == pytest.approx((value / 1.54, value * 1.54), rel=0.01)
     assert fitted.interval(name)[0] < value * np.exp(-SIGMAS_95 * form)
+
+
+@pytest.mark.parametrize(
+    "name", ["system.leak_sl_min", "ejector.blow_off_sl_min", "system.creep_ms"]
+)
+def test_a_flow_is_as_exact_as_the_volumes_that_were_told(name: str) -> None:
+    fitted = commissioned().calibration.fitted
+    number = [free.name for free in fitted.free].index(name)
+    value = fitted.free[number].of(fitted.data)
+
+    def told(factor: float) -> tuple[float, float]:
+        system = fitted.data.system.model_copy(update={"volumes_within_factor": factor})
+        data = fitted.data.model_copy(update={"system": system})
+        prior = np.full(len(fitted.free), np.inf)  # everything counts as determined
+        none = 0.0 * fitted.covariance
+        return replace(fitted, data=data, covariance=none, prior=prior).interval(name)
+
+    assert told(1.0) == pytest.approx((value, value))
+    within = 1.25 if fitted.free[number].unit == "sl/min" else 1.0
+    assert told(1.25) == pytest.approx((value / within, value * within))
 
 
 def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> None:

@@ -495,6 +495,30 @@ def test_no_size_is_told_beyond_the_bounds_of_its_effect(effect: str, typical: f
         assert first.low <= told[f"{name}low95"] < told[f"{name}high95"] <= first.high
 
 
+@pytest.mark.parametrize("effect", ["leakage", "added_volume", "suction_loss"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_flow_and_a_volume_are_as_exact_as_the_volumes_that_were_told(
+    effect: str, sign: float
+) -> None:
+    """However well a log determines them: it shows flows and volumes only relative to those."""
+    evidence, (first, *_) = collect(CONFIG, record(8.0)), EFFECTS[effect].parameters
+    cause = Cause(effect, {first.name: sign * first.typical}, Course.RAMP)
+    x = np.array([sign])
+
+    def told(factor: float) -> tuple[float, float]:
+        evidence_told = replace(evidence, volumes_within=factor)
+        low, high = x - 1e-6, x + 1e-6
+        (sizes,) = answer_module._parameters(evidence_told, cause, x, low, high).values()
+        return sizes["at_end_low95"], sizes["at_end_high95"]
+
+    exact, rough = told(1.02), told(1.25)
+    if first.scales_with_volumes:
+        ends = sorted((sign * first.typical / 1.25, sign * first.typical * 1.25))
+        assert rough == pytest.approx(np.clip(ends, first.low, first.high), rel=1e-3)
+    else:
+        assert rough == exact
+
+
 def test_few_rows_draw_the_same_curve_as_all() -> None:
     few = collect(CONFIG, record(14.0, "leakage=1", seed=28))
     every = replace(few, rows=np.arange(len(few.samples)))

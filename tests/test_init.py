@@ -116,6 +116,7 @@ def test_what_is_said_is_in_it(
     hose, sensor, cups = config.data.system.parts
     assert (hose.length_mm, hose.diameter_mm, cups.volume_ml) == (1500.0, 4.0, 60.0)
     assert sensor.kind == "sensor"
+    assert config.data.system.volumes_within_factor == 1.25  # a fifth off
     assert config.data.supply.pressure_bar == 5.5
     driver = settings_of(config.document)
     assert (driver.host, driver.port) == ("10.0.0.5", 502)
@@ -137,9 +138,18 @@ def test_what_nobody_knows_is_guessed_and_says_so(monkeypatch: pytest.MonkeyPatc
     for what in ("type", "length_mm", "diameter_mm", "volume_ml", '{ kind = "sensor" }', "host"):
         lines = [line for line in config.document.text.splitlines() if what in line]
         assert any("not known" in line or "not said" in line for line in lines), what
+    assert config.data.system.volumes_within_factor == 10.0  # any size on the market
     head = " ".join(config.document.text.split("[asset]")[0].replace("#", "").split())
     flags = "--id, --type, --address, --ring, --unit, --reference, --range, --end, --hose-mm, "
     assert f"Not said, so guessed: {flags}" in head
+
+
+def test_volumes_beside_a_tube_that_nobody_knows_are_less_exact(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """28 ml of tube are guessed, which may be three times as much: 1.25 x 60 + 3 x 28 over 88."""
+    assert twin(monkeypatch, "init", "left.toml", "--volume-ml", "60") == 0
+    assert taken("left.toml").data.system.volumes_within_factor == pytest.approx(1.81, abs=0.01)
 
 
 def test_a_unit_of_which_there_are_only_files_has_no_driver(

@@ -101,9 +101,10 @@ def test_so_it_is_where_gas_convects_behind_a_check_valve() -> None:
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
-def test_so_it_is_where_blow_off_drains_a_reservoir_against_a_relief_valve(name: str) -> None:
+def test_so_it_is_where_blow_off_drains_a_reservoir_and_closes_more_quickly(name: str) -> None:
     theta = between_samples(name, soft_and_late=False)
     theta[[c.BLOW_OFF_DRAIN, c.BLOW_OFF_REFILL]] = 6.0, 0.4
+    theta[c.BLOW_OFF_RAMP_DOWN] = 0.6 * theta[c.BLOW_OFF_RAMP]
     theta[[c.RELIEF_PRESSURE, c.RELEASE]] = 45.0 * MBAR, theta[c.RELEASE] - 30.0 * MBAR
     phases = cycle_of(name)
     expected = advance(theta, phases)

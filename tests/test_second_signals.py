@@ -122,6 +122,17 @@ def test_what_is_no_tube_takes_the_volume_that_is_metered_and_the_line_is_said()
     assert (again, remarks) == (found, [])
 
 
+@pytest.mark.parametrize(("told_within", "within"), [(1.25, 1.15), (1.02, 1.02)])
+@pytest.mark.parametrize("volume_ml", [230.0, 328.3])
+def test_with_a_flow_meter_volumes_are_at_least_as_exact_as_it(
+    volume_ml: float, told_within: float, within: float
+) -> None:
+    data = told(*REST, HOSE, CUPS)
+    system = data.system.model_copy(update={"volumes_within_factor": told_within})
+    found, _ = as_metered(data.model_copy(update={"system": system}), metered(volume_ml))
+    assert found.system.volumes_within_factor == within
+
+
 @pytest.mark.parametrize("volume_ml", [202.0, 255.0, 35.0, float("nan")])
 def test_a_volume_that_is_nearly_as_told_stays_and_one_that_tubes_alone_exceed(
     volume_ml: float,

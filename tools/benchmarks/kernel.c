@@ -19,7 +19,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, EXHAUST_FOLLOWS, FILTER_AT,
     END_FOLLOWS, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT, RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP,
     JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE, BLOW_OFF_DRAIN,
-    BLOW_OFF_REFILL, BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, RELIEF,
+    BLOW_OFF_REFILL, BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, BLOW_OFF_RAMP_DOWN, RELIEF,
     RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, CREEP, CREEP_TIME, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE,
@@ -352,7 +352,8 @@ INLINED Stage stage(const Gas *guess, const Gas *known, const Lags *lags, double
     int rising = valves->nozzle > lags->drive;
     double drive = lag(lags->drive, valves->nozzle, step, rising ? first : fall);
     double jet = lag(lags->jet, rising ? drawing(drive, k) : drive, step, rising ? rise : fall);
-    double valve = lag(lags->valve, valves->blow, step, K(BLOW_OFF_RAMP));
+    int opens = valves->blow > lags->valve;
+    double valve = lag(lags->valve, valves->blow, step, K(opens ? BLOW_OFF_RAMP : BLOW_OFF_RAMP_DOWN));
     double rate = step * K(BLOW_OFF_DRAIN);
     double drained = (lags->drained + rate * valve) / (1.0 + rate * (valve + K(BLOW_OFF_REFILL)));
     double regulated = max(K(SUPPLY) - K(DROOP) * max(valves->nozzle, valves->blow), 0.0);

@@ -7,6 +7,7 @@ and delays. The fit starts from these and searches the range of all ejectors on 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -75,6 +76,9 @@ ELSEWHERE, SURELY = 0.6, 4.0
 # A record that rises so far above ambient (mbar) has met a relief valve, which opens at about half
 # of that.
 RELIEVED, RELIEVES = 60.0, 0.5
+# Diameters of tubes, over what is configured, from which a fit that leaves too much starts again;
+# time constant with which blow-off then ends, over that of its begin.
+OTHER_BORES, CLOSES_QUICKLY = (2.0, 0.5), 0.4
 CREEPS = 0.3  # first guess of the share of the cups' yielding that comes later
 FAR_WEAKER = 0.5  # of the guess of a blow-off, below which a fit does not reach the weaker one
 DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
@@ -175,10 +179,8 @@ def commission(
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
     guesses = starts(guess, readings.meets, readings.grows, _into_hose(guess, readings))
-    fitted = _fit(used, guesses, free, progress)
-    progress("judging the fit")
-    found_cycles = Cycles.found(samples, fitted.data)
-    verdict = judge(found_cycles, fitted.data, readings.noise)
+    fits = partial(_fit, used, free=free, progress=progress)
+    fitted, found_cycles, verdict = _best(samples, readings.noise, guesses, fits, progress)
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
     fitted, remarks = _deciding(fitted, found_cycles, metered, readings)
@@ -269,6 +271,54 @@ def _fit(
         ) from error
 
 
+def _best(
+    samples: Samples,
+    noise: float,
+    guesses: Sequence[DataSet],
+    fits: Callable[[Sequence[DataSet]], Fitted],
+    progress: Callable[[str], None],
+) -> tuple[Fitted, Cycles, Verdict]:
+    """The fit from ``guesses``, with the cycles as it sees them and how well it follows them.
+
+    If that is not good, it is the better one of this and of another from other tubes.
+    """
+
+    def judged(fitted: Fitted) -> tuple[Fitted, Cycles, Verdict]:
+        progress("judging the fit")
+        cycles = Cycles.found(samples, fitted.data)
+        return fitted, cycles, judge(cycles, fitted.data, noise)
+
+    best = judged(fits(guesses))
+    if best[-1].word == "good":
+        return best
+    progress("more is left than the cycles differ: trying wider and narrower tubes")
+    other = judged(fits(other_tubes(guesses, best[0].data)))
+    return min(best, other, key=lambda result: result[-1].worst)
+
+
+def other_tubes(guesses: Sequence[DataSet], best: DataSet) -> list[DataSet]:
+    """Those ``guesses`` that are most like the ``best`` fit, with wider and narrower tubes.
+
+    A wide tube holds more gas, which is light to move. What rings in it as a valve closes has
+    another height then, and no fit leads from one to the other. Valves may also close quicker.
+    """
+
+    def unlike(guess: DataSet) -> tuple[bool, float]:
+        other_way = guess.system.part_leaves != best.system.part_leaves
+        return other_way, abs(guess.system.part_meets_ms - best.system.part_meets_ms)
+
+    nearest = min(map(unlike, guesses))
+    tables = [guess.model_dump() for guess in guesses if unlike(guess) == nearest]
+    others = []
+    for factor, table in product(OTHER_BORES, tables):
+        area = factor**2
+        line = {"line_volume_factor": area, "line_inertia_factor": 1.0 / area}
+        system = table["system"] | line | {"line_factor": 1.0 / area**2}
+        ejector = table["ejector"] | {"blow_off_closing_factor": CLOSES_QUICKLY}
+        others.append(DataSet.model_validate(table | {"system": system, "ejector": ejector}))
+    return others
+
+
 def _deciding(
     fitted: Fitted, cycles: Cycles, configured: DataSet, readings: Readings
 ) -> tuple[Fitted, list[Remark]]:
@@ -297,6 +347,8 @@ def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]
     an unknown way, and nothing is changed.
     """
     metered = readings.evacuated(data.ambient.temperature_c + ZERO_C)
+    if np.isfinite(metered):
+        data = _as_exact_as_a_meter(data)
     parts = data.system.parts
     configured = sum(volume(part) for part in parts)
     tubes = sum(volume(part) for part in parts if isinstance(part, Tube | Sensor))
@@ -316,6 +368,13 @@ def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]
     line = f"[[data.system.parts]] {'; '.join(lines)}"
     system = data.system.model_copy(update={"parts": scaled})
     return data.model_copy(update={"system": system}), [Remark(text, line)]
+
+
+def _as_exact_as_a_meter(data: DataSet) -> DataSet:
+    """``data`` with volumes that are at least as exact as those by a flow meter."""
+    within = min(data.system.volumes_within_factor, 1.0 + VOLUME_CLEARLY)
+    system = data.system.model_copy(update={"volumes_within_factor": within})
+    return data.model_copy(update={"system": system})
 
 
 def _scaled(part: Part, factor: float) -> Part:
@@ -403,6 +462,8 @@ def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambien
     if np.isfinite(blow_off):
         ejector.update(_blow_off(blow_off))
         ejector["blow_off_drain_per_s"] = DRAINS * readings.fill_rate
+    if np.isfinite(readings.blow_off_ends):
+        ejector["blow_off_response_off_ms"] = max(readings.blow_off_ends / MS - SOONEST_MS, 0.0)
     highest = (readings.highest - ambient) / MBAR
     relieved = RELIEVES * highest if highest > RELIEVED else ejector["cracking_pressure_mbar"]
     ejector["relief_pressure_mbar"] = relieved

@@ -5,6 +5,7 @@ how far units differ. Residuals are whitened by noise, scatter and the model's o
 derivatives come from one run of the bank of hypotheses.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -201,20 +202,23 @@ class Fitted:
         """95 % interval of a parameter (``table.key``), in its unit.
 
         A parameter that the log does not determine may be zero if its bounds allow that, as a leak
-        may. If the record does not come near the end pressure, that is only known to lie below the
-        deepest pressure: the record does not show how the characteristic continues.
+        may. Flows and volumes are at most as exact as the volumes that were told. If the record
+        does not come near the end pressure, that is only known to lie below the deepest pressure:
+        the record does not show how the characteristic continues.
         """
         if name == END_PRESSURE and not self.reaches_end:
             return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
         number = self._number(name)
         free, reach = self.free[number], SIGMAS_95 * float(self.spread[number])
         value = free.of(self.data)
+        told = float(np.log(self.data.system.volumes_within_factor)) * free.scales_with_volumes
         if self.scaled[number] and value > 0.0:
-            reach = float(np.hypot(reach / value, SIGMAS_95 * free.model_form))
+            reach = math.hypot(reach / value, SIGMAS_95 * free.model_form, told)
             factor = float(np.exp(min(reach, MOST_FACTOR)))
             may_be_nothing = free.low == 0.0 and not self.determined[number]
             low = 0.0 if may_be_nothing else max(value / factor, free.low)
             return low, min(value * factor, free.high)
+        reach = math.hypot(reach, told * value)
         return max(value - reach, free.low), min(value + reach, free.high)
 
     def _number(self, name: str) -> int:

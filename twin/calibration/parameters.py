@@ -37,6 +37,11 @@ class Free:
     model_form: float = 0.0
 
     @property
+    def scales_with_volumes(self) -> bool:
+        """Whether it is a flow or a volume: a record shows only what it is beside the system's."""
+        return self.unit in ("sl/min", "ml")
+
+    @property
     def name(self) -> str:
         """Table and key as in a configuration."""
         return f"{self.table}.{self.key}"
@@ -147,6 +152,7 @@ FREE_IN_MARKET = (
     Free(_E, "cracking_pressure_mbar", "mbar", 2.0, 0.0, 100.0, market=5.0, scaled=False),
     Free(_E, "relief_pressure_mbar", "mbar", 10.0, 0.0, 2000.0, market=100.0, scaled=False),
     Free(_E, "back_flow_sl_min", "sl/min", 0.4, 0.0, 5000.0, True, market=1.5),
+    Free(_E, "blow_off_closing_factor", "", 0.2, 0.02, 50.0, True, market=0.7),
     Free(_E, "blow_off_shape", "", 0.1, -0.9, 3.0, market=0.4, scaled=False),
     Free(_E, "blow_off_drain_per_s", "1/s", 0.4, 0.0, 200.0, True, market=1.5),
     Free(_E, "blow_off_refill", "", 0.2, 0.0, 5.0, True, market=1.0),

@@ -44,6 +44,8 @@ GROWING, STEEP = (0.01, 0.04), (0.1, 0.25)
 LEAST_GROWN = 0.05  # least share of the fall between the first two times at the full slope
 OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
 OPENED_FROM, OPENED_TO = 0.6, 0.85  # part of an idle in which an opened system is at ambient
+# A blow-off is steady in its last milliseconds, or is not; its valve closes within the others.
+STEADY_MS, ENDS_MS = 20.0, 150.0
 STILL = 3.0  # sigmas by which the pressure of an opened system may move in that time
 
 
@@ -78,6 +80,7 @@ class Readings:
     draw_rate: float  # 1/s, −dp/dt over pressure as suction begins
     meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
     back_rate: float  # 1/s, steepest dp/dt over ambient after suction, nothing commanded
+    blow_off_ends: float  # s after its command ends, when the pressure shows it; NaN: it does not
     grows: float  # s, in which suction grows to its full strength; NaN if that does not show
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
@@ -169,6 +172,7 @@ def read(samples: Samples) -> Readings:
         draw_rate=_draw_rate(pressure, suctions, period),
         meets=_meets(pressure, suctions, period, noise),
         back_rate=_back_rate(pressure, command_stretches, period, idle),
+        blow_off_ends=_blow_off_ends(pressure, command_stretches, period, noise),
         grows=_grows(pressure, suctions, period, noise),
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
@@ -368,6 +372,28 @@ def _fill_rate(
                 rise = curve[ended[0]] - curve[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
+
+
+def _blow_off_ends(
+    pressure: Floats, command_stretches: list[Stretch], period: float, noise: float
+) -> float:
+    """Time (s) from the end of its command until the pressure leaves a steady blow-off's level.
+
+    NaN if it is not steady at its end, or if most idles do not show it.
+    """
+    steady, rows = max(round(STEADY_MS * MS / period), 4), round(ENDS_MS * MS / period)
+    times, blow_offs = [], 0
+    for stretch, following in pairwise(command_stretches):
+        if stretch.command != Command.BLOW_OFF or following.command != 0:
+            continue
+        blow_offs += 1
+        before = pressure[max(stretch.last - steady, stretch.first) : stretch.last]
+        after = pressure[following.first : min(following.last, following.first + rows)]
+        off = np.abs(after - before.mean()) > CLEAR * noise
+        left = np.flatnonzero(off[1:] & off[:-1])  # a single row may be an outlier
+        if np.ptp(before) < 2.0 * CLEAR * noise and len(left):
+            times.append(float(left[0]) * period)
+    return _median(times) if len(times) > 0.5 * blow_offs else float("nan")
 
 
 def _back_rate(

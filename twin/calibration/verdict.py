@@ -51,8 +51,12 @@ class Verdict:
     @property
     def word(self) -> str:
         """The verdict in a word: by the worst phase."""
-        worst = max(residual.times for residual in self.residuals.values())
-        return "good" if worst <= GOOD else "usable" if worst <= USABLE else "refused"
+        return "good" if self.worst <= GOOD else "usable" if self.worst <= USABLE else "refused"
+
+    @property
+    def worst(self) -> float:
+        """Residual over the floor of the worst phase."""
+        return max(residual.times for residual in self.residuals.values())
 
     @property
     def weak(self) -> list[Phase]:

@@ -33,7 +33,7 @@ from twin.inference.levels import SIGMAS_95
 from twin.inference.unmodelled import LEAST_SURE, Odds
 from twin.instants import CALENDAR_NS, SECOND_NS
 from twin.model.courses import Cause, Course
-from twin.model.effects import effect_of
+from twin.model.effects import Parameter, effect_of
 from twin.model.mechanism import MECHANISMS
 from twin.model.term import Term
 from twin.monitor.bins import Floats
@@ -500,8 +500,10 @@ def _parameters(
             steps * p.typical if ramp else p.after(steps, theta)
             for steps in map(float, (size, below, above))
         )
-        scale_error = SIGMAS_95 * p.relative_error * value
-        down, up = (math.hypot(end - value, scale_error) for end in (lower, upper))
+        toward_zero, away = _relative_errors(p, evidence.volumes_within)
+        smaller, larger = (toward_zero, away) if value > 0.0 else (away, toward_zero)
+        down = math.hypot(lower - value, smaller * value)
+        up = math.hypot(upper - value, larger * value)
         shift = at_neutral - neutral  # a ramp's values are changes, its bounds are not
         low, high = max(value - down, p.low - shift), min(value + up, p.high - shift)
         per_hour = 1.0 / hours(evidence, cause) if ramp else 1.0
@@ -515,6 +517,16 @@ def _parameters(
             for name, change in (("at_end", value), ("at_end_low95", low), ("at_end_high95", high)):
                 entries[p.name][name] = rounded(at_neutral + change)
     return entries
+
+
+def _relative_errors(p: Parameter, volumes_within: float) -> tuple[float, float]:
+    """What a size may be off at most (95 %), relative, toward zero and away, beyond the log's part.
+
+    A flow or volume is as many times larger or smaller as the system's volumes are than told.
+    """
+    if p.scales_with_volumes:
+        return 1.0 - 1.0 / volumes_within, volumes_within - 1.0
+    return SIGMAS_95 * p.relative_error, SIGMAS_95 * p.relative_error
 
 
 def _why(

@@ -106,6 +106,7 @@ class Evidence:
     calibrated: Theta  # ``theta`` in the surroundings of the calibration
     told: frozenset[str] = frozenset()  # measured surroundings
     another_day: bool = True  # the log is of another day than the calibration
+    volumes_within: float = 1.0  # factor to the true volumes, as told
     catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # beside the table
     _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
 
@@ -473,6 +474,7 @@ def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
         judged=[],
         figures=[],
         healthy=config.monitor.healthy,
+        volumes_within=config.data.system.volumes_within_factor,
         noise=config.data.sensor.noise_mbar,
         bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), [], knees),
         rows=np.empty(0, np.int64),

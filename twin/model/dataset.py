@@ -126,6 +126,7 @@ class Ejector(Settings):
     # From the end of the command to the valve's action.
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
     blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)  # time constant of the flow
+    blow_off_closing_factor: float = Field(1.0, ge=0.02, le=50.0)  # of its end, over that
     exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
     filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)  # 1: the sensor is behind its filter
     end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)  # times as end_pressure_slope has it
@@ -200,6 +201,8 @@ class System(Settings):
         Tube(kind="tube", length_mm=100.0, diameter_mm=6.0),
         Vessel(kind="vessel", volume_ml=750.0),
     )
+    # Their true volume is within this factor, with 95 %; flows and volumes found are as exact.
+    volumes_within_factor: float = Field(1.06, ge=1.0, le=100.0)
     film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
     free_convection: float = Field(
         0.0, ge=0.0, le=1.0
@@ -341,6 +344,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.BLOW_OFF_RESPONSE] = ejector.blow_off_response_ms * MS
     theta[c.BLOW_OFF_RESPONSE_OFF] = ejector.blow_off_response_off_ms * MS
     theta[c.BLOW_OFF_RAMP] = ejector.blow_off_ramp_ms * MS
+    theta[c.BLOW_OFF_RAMP_DOWN] = ejector.blow_off_closing_factor * ejector.blow_off_ramp_ms * MS
     theta[c.RELIEF] = ejector.relief_sl_min * SL_MIN / (100.0 * MBAR)
     theta[c.RELIEF_PRESSURE] = ejector.relief_pressure_mbar * MBAR
     theta[c.BACK_FLOW] = ejector.back_flow_sl_min * SL_MIN

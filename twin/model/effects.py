@@ -40,7 +40,7 @@ class Parameter:
     ratio: bool = False  # what matters is how many times as large it is: a time constant
     usual: float | None = None  # of what shapes an effect that was seen before
     is_of_the_log: bool = False  # a phase: another log has another one
-    # Of an estimate, one sigma: from the scale of the data set, that is, of volume and suction.
+    # Of an estimate, one sigma; not of flows and volumes, which are as exact as the system's.
     relative_error: float = 0.03
     # One sigma by which it differs from cycle to cycle in a healthy ejector, in its unit, until a
     # better one is learned; 0: it does not.
@@ -50,6 +50,11 @@ class Parameter:
     def is_time(self) -> bool:
         """Whether it is a delay or a time constant: it shifts edges, and acts nonlinearly."""
         return self.unit == "ms"
+
+    @property
+    def scales_with_volumes(self) -> bool:
+        """Whether it is a flow or a volume: pressures show only what it is beside the system's."""
+        return self.unit in ("sl/min", "ml")
 
     @property
     def shapes(self) -> bool:

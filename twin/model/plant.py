@@ -539,7 +539,8 @@ def stage(
     jet = lag_stage(
         lags.jet, jet_strength(drive, k, i) if rising else drive, step, rise if rising else fall
     )
-    valve = lag_stage(lags.valve, blow, step, k[c.BLOW_OFF_RAMP, i])
+    opening, closing = k[c.BLOW_OFF_RAMP, i], k[c.BLOW_OFF_RAMP_DOWN, i]
+    valve = lag_stage(lags.valve, blow, step, opening if blow > lags.valve else closing)
     drained = drain_stage(lags.drained, valve, step, k, i)
     regulated = max(k[c.SUPPLY, i] - k[c.DROOP, i] * max(nozzle, blow), 0.0)
     supply = lag_stage(lags.supply, regulated, step, k[c.SUPPLY_LAG, i])
