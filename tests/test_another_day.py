@@ -12,6 +12,7 @@ import rigs
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.experiments import beside_weather
 from twin.diagnosis.hypotheses import often, price
 from twin.diagnosis.linear_screening import columns, promises, signatures
 from twin.diagnosis.residual_covariance import covariance
@@ -145,6 +146,19 @@ def test_a_gauge_sensor_reads_ambient_as_it_was_assumed() -> None:
 
     assert change_in_idle(is_gauge=False) == pytest.approx(-20.0, abs=1.0)
     assert change_in_idle(is_gauge=True) == pytest.approx(0.0, abs=1.0)
+
+
+def test_a_log_that_weather_alone_may_explain_asks_for_a_barometer() -> None:
+    """A fault that looks like 12 mbar less weather could be there, though nothing is named."""
+    samples = rigs.recorded("gripper", 30.0, ("ambient_pressure=-12",), seed=9)[0].copy()
+    samples["pressure"] += 12.0 * MBAR  # a gauge sensor counts from the ambient pressure of then
+    evidence = collect(rigs.config("gripper").with_sensor(is_gauge=True), [samples])
+    sentence = beside_weather(evidence, covariance(evidence))
+    assert sentence is not None
+    assert "record ambient pressure as well: " in sentence
+    told = replace(evidence, told=BOTH)
+    assert beside_weather(told, covariance(told)) is None
+    assert beside_weather(collected(), covariance(collected())) is None
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from twin.diagnosis import experiments
@@ -102,6 +103,25 @@ def test_what_to_record_is_german(
     german = in_german(sentence)
     assert not ENGLISH_WORDS.search(german)
     assert not re.search(r"leakage|_|mechanism\b", german)
+
+
+@pytest.mark.parametrize("told", [frozenset(), frozenset({"ambient"})])
+def test_what_to_measure_beside_weather_is_german(
+    monkeypatch: pytest.MonkeyPatch, told: frozenset[str]
+) -> None:
+    def explained(*_: object) -> npt.NDArray[np.float64]:
+        return np.full(4, 5.6)
+
+    monkeypatch.setattr(experiments, "explained_by_day", explained)
+    bins = SimpleNamespace(count=np.ones(4))
+    evidence: Any = SimpleNamespace(
+        off=lambda _: np.zeros((4, 1)), bins=bins, told=told, judged=[1]
+    )
+    healthy: Any = SimpleNamespace(of=lambda _: SimpleNamespace(usual=1.0))
+    sentence = experiments.beside_weather(evidence, healthy)
+    assert sentence is not None
+    assert not ENGLISH_WORDS.search(in_german(sentence))
+    assert "5.6 mbar" in sentence
 
 
 @pytest.mark.parametrize("over", ["time", "vacuum", None])

@@ -19,7 +19,7 @@ from twin.diagnosis.evidence import (
     read_cycles,
     thinned,
 )
-from twin.diagnosis.experiments import next_experiment
+from twin.diagnosis.experiments import beside_weather, next_experiment
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
@@ -175,7 +175,9 @@ def diagnose(
         "baseline": before.figures,
         "extended": findings.after.figures,
         "gain": gain(before, findings.after),
-        "next_experiment": next_experiment(evidence, findings.searched, findings.mechanism),
+        "next_experiment": beside_weather(evidence, healthy)
+        if findings.verdict == "consistent"
+        else next_experiment(evidence, findings.searched, findings.mechanism),
     }
     return Diagnosis(
         evidence,

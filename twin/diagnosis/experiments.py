@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.diagnosis.evidence import Evidence, Hypothesis, of_log
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, of_log
 from twin.diagnosis.fit import fit
 from twin.diagnosis.mechanisms import Explained
-from twin.diagnosis.residual_covariance import covariance
+from twin.diagnosis.residual_covariance import Covariance, covariance, explained_by_day
 from twin.diagnosis.search import Search
 from twin.model import kernel
 from twin.model import theta as c
@@ -24,6 +24,7 @@ ENOUGH = 5.0  # sigmas that separate two causes for certain
 REPEATS = 4  # of a test: the model settles in the first
 MOST_RIVALS = 3
 SUPPLY_STEP = 1.0 * BAR
+HIDES = 1.0  # rms of what looks like another weather, over what healthy cycles leave
 
 _OFF, _SUCTION, _BLOW = 0, int(Command.SUCTION), int(Command.BLOW_OFF)
 Program = Sequence[tuple[int, int]]  # command, ms
@@ -102,6 +103,26 @@ def next_experiment(
     )
     text, hypothesis = " and ".join(searched.found.effects), searched.found.hypothesis
     return _recording(evidence, hypothesis, [rival.hypothesis for rival in rivals], text, names)
+
+
+def beside_weather(evidence: Evidence, healthy: Covariance) -> str | None:
+    """What to measure if a ``consistent`` log deviates as another weather does; else None.
+
+    Then it is consistent because nobody measured the weather, and a fault could hide behind that.
+    """
+    unmeasured = [name for name in ("ambient", "temperature") if name not in evidence.told]
+    if not unmeasured:
+        return None
+    (off,) = evidence.off([HEALTHY]).T
+    count = evidence.bins.count
+    explained = float(np.sqrt(np.average(explained_by_day(healthy, off) ** 2, weights=count)))
+    if not explained > HIDES * healthy.of(evidence.judged).usual:
+        return None
+    missing = {"ambient": "ambient pressure", "temperature": "temperature"}[unmeasured[0]]
+    return (
+        f"record {missing} as well: {explained:.1f} mbar of the deviation (rms) look like another"
+        " weather, and a fault of that size could hide behind it"
+    )
 
 
 def _recording(

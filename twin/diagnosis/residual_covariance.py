@@ -175,7 +175,7 @@ def covariance(
         day_mismatch=np.zeros_like(off),
         of_weather=of_weather,
     )
-    return replace(exact, day_mismatch=MISMATCH * _explained_by_day(exact, off))
+    return replace(exact, day_mismatch=MISMATCH * explained_by_day(exact, off))
 
 
 def opened_by_calibration(
@@ -193,7 +193,7 @@ def opened_by_calibration(
     return nearby * tied, opened - healthy * np.tile(tied, 1 + both_ways)
 
 
-def _explained_by_day(residual_covariance: Covariance, off: Floats) -> Floats:
+def explained_by_day(residual_covariance: Covariance, off: Floats) -> Floats:
     """What the log's day probably explains of what is ``off`` (mbar), in each bin."""
     days, evidence = residual_covariance.another_day, residual_covariance.evidence
     weights = replace(residual_covariance, another_day=days[:, :0]).of(evidence.judged)

@@ -35,6 +35,10 @@ _EXPERIMENTS = (  # what to record next
     "no recording of this sensor is predicted to part {causes} from {rivals} (at most {sigmas}"
     " sigma): measure one of them by other means",
     "what else it may be",
+    "record {what} as well: {size} mbar of the deviation (rms) look like another weather, and a"
+    " fault of that size could hide behind it",
+    "ambient pressure",
+    "temperature",
 )
 _UNLISTED = (  # the shape of something unlisted
     "another one in each cycle: no term of the model can take it away",

@@ -193,9 +193,9 @@ def _beside_rivals(
 ) -> tuple[_Found, list[list[Fitted]]] | None:
     """What was found and, for each of its causes, the rivals that fit in its place.
 
-    A rival that is clearly better was missed by the search: it replaces what was found. If it is
-    not confirmed on held-out cycles, no listed effect acts there, and both are dropped. None if no
-    cause remains.
+    A rival that is likelier replaces what was found, if it is confirmed on held-out cycles. If it
+    is clearly better and not confirmed, no listed effect acts there, and both are dropped. None if
+    no cause remains.
     """
     visited = set[frozenset[tuple[str, Course]]]()
     while True:
@@ -207,7 +207,7 @@ def _beside_rivals(
         rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
         if _is_weather_alone(current.found):
             return _weather_or_rival(evidence, fitted, current, rivals[0])
-        better = _overtaking(current.found, rivals)
+        better = _likelier(evidence, current.found, rivals)
         if better is None or better.kind in visited:
             break
         residual_covariance = covariance(evidence, better.hypothesis)
@@ -217,6 +217,8 @@ def _beside_rivals(
         if confirmed is better:
             current = _about(evidence, fitted, better.hypothesis)
             continue
+        if not _is_clearly_better(better, current.found):
+            break
         if confirmed and stranger(better, current.found) in confirmed.effects:
             break
         number = next(
@@ -628,10 +630,20 @@ def _weather_gain(evidence: Evidence, unseen: Weights, weather: Hypothesis) -> t
     return gain - reach, gain + reach
 
 
-def _overtaking(found: Fitted, rivals: Sequence[Sequence[Fitted]]) -> Fitted | None:
-    """The best rival if it is clearly better than what was found."""
-    best = min(chain.from_iterable(rivals), key=lambda candidate: candidate.score, default=found)
-    return best if best.score < found.score - CHI2_999 * max(best.leftover**2, 1.0) else None
+def _likelier(
+    evidence: Evidence, found: Fitted, rivals: Sequence[Sequence[Fitted]]
+) -> Fitted | None:
+    """The likeliest rival if it is likelier than what was found, as probabilities count them."""
+
+    def tempered(fitted: Fitted) -> float:
+        return score_with_tempered_prior(evidence, fitted.score, fitted.hypothesis)
+
+    best = min(chain((found,), *rivals), key=tempered)
+    return None if best is found else best
+
+
+def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
+    return rival.score < found.score - CHI2_999 * max(rival.leftover**2, 1.0)
 
 
 def _rivals(
