@@ -23,6 +23,7 @@ from twin.diagnosis import search as search_module
 from twin.diagnosis.answer import EXPLAINED, Diagnosis, _left_in_all, diagnose
 from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
 from twin.diagnosis.fit import Fitted
+from twin.diagnosis.healthy import apart
 from twin.diagnosis.held_out import gain, judge
 from twin.diagnosis.hypotheses import price
 from twin.diagnosis.linear_screening import signatures
@@ -30,6 +31,7 @@ from twin.diagnosis.onset import tried_in_or_out
 from twin.diagnosis.residual_covariance import covariance, levels
 from twin.diagnosis.search import _about, _confirmed, held_out_gain
 from twin.diagnosis.unlisted import Unlisted, look
+from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
@@ -510,7 +512,10 @@ def test_a_flow_and_a_volume_are_as_exact_as_the_volumes_that_were_told(effect: 
 
     exact, rough = told(1.02), told(1.25)
     if first.scales_with_volumes:
-        assert rough == pytest.approx((first.typical / 1.25, first.typical * 1.25), rel=1e-3)
+        of_model = SIGMAS_95 * first.relative_error
+        down, up = math.hypot(0.2, of_model), math.hypot(0.25, of_model)
+        ends = first.typical * (1.0 - down), first.typical * (1.0 + up)
+        assert rough == pytest.approx(ends, rel=1e-3)
     else:
         assert rough == exact
 
@@ -560,6 +565,37 @@ def test_one_odd_cycle_or_many_leave_the_order_of_cycles_as_it_is(
     are_odd = np.isin(evidence.judged, list(odd))
     monkeypatch.setattr(answer_module, "are_odd", lambda _left: are_odd)
     assert answer_module.split(evidence, healthy) == plain
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_cycles_that_deviate_fall_into_both_parts_however_they_come(
+    part: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They come just as the cycles are split: fitted where the effect is not, it stayed unseen."""
+    evidence = collect(CONFIG, record(30.0, seed=36))
+    healthy = covariance(evidence)
+    plain = answer_module.split(evidence, healthy)
+    affected = set(plain[part])
+    chi2 = np.where(np.isin(evidence.judged, list(affected)), 6.0, 1.0)
+    monkeypatch.setattr(answer_module, "_deviations", lambda *_: chi2)
+    monkeypatch.setattr(answer_module, "are_odd", lambda left: left < 0.0)
+    fitted, held_out = answer_module.split(evidence, healthy)
+    assert sorted(fitted + held_out) == evidence.judged
+    assert min(len(affected & set(fitted)), len(affected & set(held_out))) >= len(affected) // 3
+
+
+@pytest.mark.parametrize(
+    ("chi2", "upper"),
+    [
+        ([1.0, 1.1, 6.0, 0.9, 5.0, 1.2], [2, 4]),
+        ([1.0, 1.3, 0.8, 0.9, 1.2, 1.1], []),
+        ([1.0, 1.1, 6.0, 0.9, 1.0, 1.2], []),
+    ],
+)
+def test_two_groups_of_cycles_are_apart_where_both_have_some(
+    chi2: list[float], upper: list[int]
+) -> None:
+    assert np.flatnonzero(apart(np.array(chi2))).tolist() == upper
 
 
 def test_thresholds_that_come_and_go_are_found_by_the_levels() -> None:

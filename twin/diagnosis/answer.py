@@ -21,11 +21,11 @@ from twin.diagnosis.evidence import (
 )
 from twin.diagnosis.experiments import beside_weather, next_experiment
 from twin.diagnosis.fit import Fitted, white
-from twin.diagnosis.healthy import are_odd, left_in_each, usual_leftover
+from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
-from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
+from twin.diagnosis.residual_covariance import Covariance, Weights, covariance, on_one_day
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
@@ -36,7 +36,7 @@ from twin.model.courses import Cause, Course
 from twin.model.effects import Parameter, effect_of
 from twin.model.mechanism import MECHANISMS
 from twin.model.term import Term
-from twin.monitor.bins import Floats
+from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.monitor.signal_checks import standing
@@ -366,19 +366,38 @@ def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]
 
     The sequence has no period, so an effect in every second or third cycle falls into both halves.
     If few cycles are odd, they are split first, so an effect in them alone falls into both as well.
-    A single odd cycle keeps its place: a nozzle that went on once more is no cause to fit.
+    So are cycles that deviate much, if nearly all of them fell into one part: then an effect that
+    comes and goes would be fitted where it is not, or judged where it is not. A single odd cycle
+    keeps its place: a nozzle that went on once more is no cause to fit.
     """
-    residuals = [white(evidence, healthy.of([cycle]), [HEALTHY]) for cycle in evidence.judged]
-    odd = are_odd(np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals]))  # pyright: ignore[reportArgumentType]
+    cycles = np.array(evidence.judged)
+    odd = are_odd(_deviations(evidence, healthy))
     if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
-        odd[:] = False
-    odd_first = [
-        cycle for first in (True, False) for cycle in np.array(evidence.judged)[odd == first]
-    ]
-    held_out = {
-        int(cycle) for position, cycle in enumerate(odd_first) if (position + 3).bit_count() % 2
-    }
+        odd = apart(_deviations(evidence, on_one_day(healthy)))
+        held_out = _held_out(cycles)
+        if all(_in_both(cycles[odd == group], held_out) for group in (True, False)):
+            odd[:] = False
+    held_out = _held_out(np.concatenate([cycles[odd], cycles[~odd]]))
     return [cycle for cycle in evidence.judged if cycle not in held_out], sorted(held_out)
+
+
+def _deviations(evidence: Evidence, residual_covariance: Covariance) -> Floats:
+    """Mean square of each judged cycle's residuals without causes, in sigmas."""
+    residuals = [
+        white(evidence, residual_covariance.of([cycle]), [HEALTHY]) for cycle in evidence.judged
+    ]
+    return np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals])
+
+
+def _held_out(ordered: Ints) -> set[int]:
+    """Cycles of these that are held out: a sequence without any period says which."""
+    return {int(cycle) for position, cycle in enumerate(ordered) if (position + 3).bit_count() % 2}
+
+
+def _in_both(group: Ints, held_out: set[int]) -> bool:
+    """Whether a third of a group's cycles, rounded down, is held out and as many are not."""
+    inside = sum(int(cycle) in held_out for cycle in group)
+    return min(inside, len(group) - inside) >= len(group) // 3
 
 
 def _runners_up(searched: Search) -> list[dict[str, Any]]:
@@ -526,9 +545,12 @@ def _relative_errors(p: Parameter, volumes_within: float) -> tuple[float, float]
 
     A flow or volume is as many times larger or smaller as the system's volumes are than told.
     """
-    if p.scales_with_volumes:
-        return 1.0 - 1.0 / volumes_within, volumes_within - 1.0
-    return SIGMAS_95 * p.relative_error, SIGMAS_95 * p.relative_error
+    of_model = SIGMAS_95 * p.relative_error
+    if not p.scales_with_volumes:
+        return of_model, of_model
+    return math.hypot(of_model, 1.0 - 1.0 / volumes_within), math.hypot(
+        of_model, volumes_within - 1.0
+    )
 
 
 def _why(

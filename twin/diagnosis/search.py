@@ -194,8 +194,8 @@ def _beside_rivals(
     """What was found and, for each of its causes, the rivals that fit in its place.
 
     A rival that is likelier replaces what was found, if it is confirmed on held-out cycles. If it
-    is clearly better and not confirmed, no listed effect acts there, and both are dropped. None if
-    no cause remains.
+    is clearly better and not confirmed, no listed effect acts there, and both are dropped; so are
+    they if it is weather, which is within what a healthy twin allows. None if no cause remains.
     """
     visited = set[frozenset[tuple[str, Course]]]()
     while True:
@@ -217,7 +217,7 @@ def _beside_rivals(
         if confirmed is better:
             current = _about(evidence, fitted, better.hypothesis)
             continue
-        if not _is_clearly_better(better, current.found):
+        if not (_is_weather_alone(better) or _is_clearly_better(better, current.found)):
             break
         if confirmed and stranger(better, current.found) in confirmed.effects:
             break
