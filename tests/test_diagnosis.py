@@ -577,11 +577,27 @@ def test_cycles_that_deviate_fall_into_both_parts_however_they_come(
     plain = answer_module.split(evidence, healthy)
     affected = set(plain[part])
     chi2 = np.where(np.isin(evidence.judged, list(affected)), 6.0, 1.0)
-    monkeypatch.setattr(answer_module, "_deviations", lambda *_: chi2)
+    monkeypatch.setattr(answer_module, "_left_by_cycle", lambda *_: chi2)
     monkeypatch.setattr(answer_module, "are_odd", lambda left: left < 0.0)
     fitted, held_out = answer_module.split(evidence, healthy)
     assert sorted(fitted + held_out) == evidence.judged
     assert min(len(affected & set(fitted)), len(affected & set(held_out))) >= len(affected) // 3
+
+
+@pytest.mark.parametrize("odd", [[], [3], [3, 6]])
+def test_a_consistent_log_names_cycles_that_are_not(
+    odd: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What acts in one cycle of eight is not seen again, so it is no cause; but it is no health."""
+    evidence = collect(CONFIG, record(30.0, seed=36))
+    chi2 = np.where(np.isin(evidence.judged, odd), 40.0, 0.8)
+    monkeypatch.setattr(answer_module, "_left_by_cycle", lambda *_: chi2)
+    sentence = answer_module._odd_cycles(evidence, covariance(evidence))
+    if not odd:
+        assert sentence is None
+        return
+    assert sentence is not None
+    assert sentence.startswith(f"cycle{'s' * (len(odd) > 1)} {', '.join(map(str, odd))} alone ")
 
 
 @pytest.mark.parametrize(

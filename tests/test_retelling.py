@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from twin.diagnosis import experiments
+from twin.diagnosis import answer, experiments
 from twin.diagnosis.answer import insufficient
 from twin.diagnosis.retelling import retold, templates
 from twin.diagnosis.unlisted import Unlisted
@@ -103,6 +103,20 @@ def test_what_to_record_is_german(
     german = in_german(sentence)
     assert not ENGLISH_WORDS.search(german)
     assert not re.search(r"leakage|_|mechanism\b", german)
+
+
+@pytest.mark.parametrize("odd", [[2], [1, 3]])
+def test_odd_cycles_are_german(monkeypatch: pytest.MonkeyPatch, odd: list[int]) -> None:
+    chi2 = np.where(np.isin(np.arange(8), odd), 40.0, 1.0)
+    monkeypatch.setattr(answer, "_left_by_cycle", lambda *_: chi2)
+    bins = SimpleNamespace(cycle=np.arange(8), count=np.ones(8))
+    evidence: Any = SimpleNamespace(
+        off=lambda _: np.full((8, 1), 7.0), bins=bins, judged=range(8), numbers=np.arange(8)
+    )
+    healthy: Any = SimpleNamespace(of=lambda _: None)
+    sentence = answer._odd_cycles(evidence, healthy)
+    assert sentence is not None
+    assert not ENGLISH_WORDS.search(in_german(sentence))
 
 
 @pytest.mark.parametrize("told", [frozenset(), frozenset({"ambient"})])

@@ -175,7 +175,7 @@ def diagnose(
         "baseline": before.figures,
         "extended": findings.after.figures,
         "gain": gain(before, findings.after),
-        "next_experiment": beside_weather(evidence, healthy)
+        "next_experiment": _odd_cycles(evidence, healthy) or beside_weather(evidence, healthy)
         if findings.verdict == "consistent"
         else next_experiment(evidence, findings.searched, findings.mechanism),
     }
@@ -296,8 +296,31 @@ def _signals(log: LogCycles) -> list[dict[str, str]]:
 
 def _left_in_all(evidence: Evidence, weights: Weights) -> float:
     """Leftover (sigmas) of the twin without causes over all cycles; an odd cycle counts little."""
+    return usual_leftover(_left_by_cycle(evidence, weights))
+
+
+def _left_by_cycle(evidence: Evidence, weights: Weights) -> Floats:
+    """Chi-square of the twin without causes per residual in each cycle, by weights of all."""
     residuals = white(evidence, weights, [HEALTHY])[: len(weights.bins), 0]
-    return usual_leftover(left_in_each(evidence, weights, residuals))
+    return left_in_each(evidence, weights, residuals)
+
+
+def _odd_cycles(evidence: Evidence, healthy: Covariance) -> str | None:
+    """The cycles of a ``consistent`` log that are not, in words; None if there are none."""
+    chi2 = _left_by_cycle(evidence, healthy.of(evidence.judged))
+    odd = np.array(evidence.judged)[are_odd(np.maximum(chi2, 1.0))]
+    if not len(odd):
+        return None
+    bins = evidence.bins
+    rows = np.isin(bins.cycle, odd)
+    (off,) = evidence.off([HEALTHY]).T
+    rms = float(np.sqrt(np.average(off[rows] ** 2, weights=bins.count[rows])))
+    cycles = ", ".join(str(evidence.numbers[cycle]) for cycle in odd)
+    which = f"cycles {cycles} alone deviate" if len(odd) > 1 else f"cycle {cycles} alone deviates"
+    return (
+        f"{which}, by {rms:.1f} mbar (rms): so few cannot show a cause;"
+        " record more cycles if it comes again"
+    )
 
 
 def _verdict(
@@ -373,7 +396,7 @@ def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]
     cycles = np.array(evidence.judged)
     odd = are_odd(_deviations(evidence, healthy))
     if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
-        odd = apart(_deviations(evidence, on_one_day(healthy)))
+        odd = apart(_left_by_cycle(evidence, on_one_day(healthy).of(evidence.judged)))
         held_out = _held_out(cycles)
         if all(_in_both(cycles[odd == group], held_out) for group in (True, False)):
             odd[:] = False

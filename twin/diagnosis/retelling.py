@@ -39,6 +39,10 @@ _EXPERIMENTS = (  # what to record next
     " fault of that size could hide behind it",
     "ambient pressure",
     "temperature",
+    "cycle {cycle} alone deviates, by {size} mbar (rms): so few cannot show a cause; record more"
+    " cycles if it comes again",
+    "cycles {cycles} alone deviate, by {size} mbar (rms): so few cannot show a cause; record more"
+    " cycles if it comes again",
 )
 _UNLISTED = (  # the shape of something unlisted
     "another one in each cycle: no term of the model can take it away",

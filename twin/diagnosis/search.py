@@ -193,8 +193,9 @@ def _beside_rivals(
 ) -> tuple[_Found, list[list[Fitted]]] | None:
     """What was found and, for each of its causes, the rivals that fit in its place.
 
-    A rival that is likelier replaces what was found, if it is confirmed on held-out cycles. If it
-    is clearly better and not confirmed, no listed effect acts there, and both are dropped; so are
+    A rival that is likelier replaces what was found, if it is confirmed on held-out cycles and
+    likelier by weights about itself as well: those about what was found are one picture. If it is
+    clearly better and not confirmed, no listed effect acts there, and both are dropped; so are
     they if it is weather, which is within what a healthy twin allows. None if no cause remains.
     """
     visited = set[frozenset[tuple[str, Course]]]()
@@ -214,10 +215,19 @@ def _beside_rivals(
         confirmed = _confirmed(
             evidence, fitted, replace(current, found=better, known=residual_covariance)
         )
+        clearly = _is_clearly_better(better, current.found)
         if confirmed is better:
-            current = _about(evidence, fitted, better.hypothesis)
-            continue
-        if not (_is_weather_alone(better) or _is_clearly_better(better, current.found)):
+            candidate = _about(evidence, fitted, better.hypothesis)
+            behind = _own_score(candidate) - _own_score(current)
+            by_own_weights = replace(candidate.found, score=current.found.score + behind)
+            if clearly or _likelier(evidence, current.found, [[by_own_weights]]):
+                current = candidate
+                continue
+            return current, [
+                [by_own_weights if rival is better else rival for rival in rivals_of_cause]
+                for rivals_of_cause in rivals
+            ]
+        if not (clearly or _is_weather_alone(better)):
             break
         if confirmed and stranger(better, current.found) in confirmed.effects:
             break
@@ -640,6 +650,11 @@ def _likelier(
 
     best = min(chain((found,), *rivals), key=tempered)
     return None if best is found else best
+
+
+def _own_score(current: _Found) -> float:
+    """Score by weights about the causes themselves, which differ in their volume as well."""
+    return current.found.score + current.weights.volume
 
 
 def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
