@@ -21,7 +21,7 @@ from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.monitor.model_bank import SUSPECTS
 from twin.monitor.scatter_covariance import SCATTERING
-from twin.signals import BAR, MBAR, MS, Command, Phase
+from twin.signals import BAR, MBAR, ML, MS, SL_MIN, Command, Phase
 
 TWIN = Path(__file__).parents[1] / "twin"
 
@@ -72,6 +72,21 @@ def leaking(rig: str) -> Theta:
     theta[c.LEAK] *= 5.0
     theta[c.H1], theta[c.H1_LOW] = 650 * MBAR, 640 * MBAR
     return theta
+
+
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_change_worth_an_alarm_is_smaller_on_a_small_unit(name: str) -> None:
+    """A leak of 0.2 sl/min is a tenth of what an ejector of 2 sl/min draws."""
+    theta, (leak,) = rigs.theta(name), EFFECTS["leakage"].parameters
+    (volume,), (loss,) = EFFECTS["added_volume"].parameters, EFFECTS["suction_loss"].parameters
+    usual = [p.typical_on(theta) for p in (leak, volume, loss)]
+    assert usual == [p.typical for p in (leak, volume, loss)]
+    small = theta.copy()
+    small[c.SUCTION] = 3.0 * SL_MIN
+    small[[c.PORT_VOLUME, c.LINE_VOLUME, c.VOLUME]] = 1.0 * ML, 2.0 * ML, 12.0 * ML
+    assert [p.typical_on(small) for p in (leak, volume, loss)] == pytest.approx(
+        [0.1 * leak.typical, 0.1 * volume.typical, loss.typical]
+    )
 
 
 def test_the_table_has_every_effect_that_was_promised() -> None:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from twin.inference.sensitivities import STEP
 from twin.model.dataset import DataSet, sensor_place
+from twin.model.effects import is_of_volumes
 
 Floats = npt.NDArray[np.float64]
 
@@ -39,7 +40,7 @@ class Free:
     @property
     def scales_with_volumes(self) -> bool:
         """Whether it is a flow or a volume: a record shows only what it is beside the system's."""
-        return self.unit in ("sl/min", "ml")
+        return is_of_volumes(self.unit)
 
     @property
     def name(self) -> str:

@@ -409,7 +409,7 @@ def _deviations(evidence: Evidence, residual_covariance: Covariance) -> Floats:
     residuals = [
         white(evidence, residual_covariance.of([cycle]), [HEALTHY]) for cycle in evidence.judged
     ]
-    return np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals])
+    return np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals])  # pyright: ignore[reportReturnType]
 
 
 def _held_out(ordered: Ints) -> set[int]:

@@ -57,6 +57,7 @@ from twin.signals import (
 
 OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
+SCAN_MS = 1.0  # cycle time of a PLC's fast task
 NEARBY = 0.1  # sigmas of a data set's uncertainty, within which the model is straight
 FASTEST, PIECE = 1, 100_000  # zlib's level, with which a row takes 4 bytes; rows of a piece
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
@@ -137,6 +138,15 @@ class Evidence:
         """Time (s) of each row since the first one."""
         times: Floats = (self.samples["time_ns"] - self.begin_ns) * NS
         return times
+
+    @cached_property
+    def least_time_ms(self) -> float:
+        """One sigma of the time of a command: it is seen at the next row, if rows are slow.
+
+        A PLC reads pressure and commands in one scan, of a millisecond; then its time is known.
+        """
+        slower = max(sampling_ms(self.samples) ** 2 - SCAN_MS**2, 0.0)
+        return math.sqrt(slower / 12.0)
 
     @cached_property
     def cycle_of_row(self) -> Ints:

@@ -4,6 +4,7 @@ Scatter differs from cycle to cycle and averages out. The model's error is the s
 and does not. A share of what a hypothesis explains counts as its error as well.
 """
 
+import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ from twin.signals import MS, Phase
 # linear in them.
 _OPENS = {name: p.touches[0] for name, p in SCATTERING.items() if p.is_time}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
+ROW = math.sqrt(3.0)  # half a row, over the sigma of a time that is anywhere within a row
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
 KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
 # Columns of ``moved`` for that: knees of a cycle are independent.
@@ -237,19 +239,22 @@ def moved(
     """Deviation of a hypothesis (mbar), and its changes by scatter and by uncertainty, (bins, ·).
 
     Changes by scatter are in this order: each effect in ``sizes``; one sigma of the times at which
-    valves close, and of the knees; the second order of such times. Changes by uncertainty are those
+    valves close, and of the knees; the second order of such times. A time is varied by half a row
+    where that is more: the response of an edge bends within it. Changes by uncertainty are those
     of the ``uncertain`` data sets, first and second order. Without ``both_ways`` only the first of
     each pair counts.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
     delays = [(_OPENS[name], size) for name, (_, size) in sizes.items() if name in _OPENS]
-    times = [*delays, *((closes, CLOSING_MS) for closes in _CLOSES)]
+    closing = max(CLOSING_MS, evidence.least_time_ms)
+    times = [*delays, *((closes, closing) for closes in _CLOSES)]
+    steps = [max(sigma, ROW * evidence.least_time_ms) for _, sigma in times]
     steady = steady[: len(steady) - len(delays)]
     knee_shift = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
     variants = [
-        (_with_delay(evidence.theta, *time_change, sign), 0)
+        (_with_delay(evidence.theta, coefficient, step, sign), 0)
         for sign in (1, -1)
-        for time_change in times
+        for (coefficient, _), step in zip(times, steps, strict=True)
     ]
     variants[len(times) : len(times)] = [(evidence.theta, knee_shift)]
     variants.append((evidence.theta, -knee_shift))
@@ -264,7 +269,12 @@ def moved(
     ends = np.cumsum([len(steady), *[len(times) + 1] * 2, len(uncertain)])
     deviation, changes = derivatives(off)
     linear, sooner, later, up, down = np.split(changes, ends, axis=1)
-    moves, left_open = central(sooner, later), central(up, down) if both_ways else (up,)
+    shares = np.array([sigma / step for (_, sigma), step in zip(times, steps, strict=True)] + [1.0])
+    first, second = central(sooner, later)
+    moves, left_open = (
+        (first * shares, second * shares**2),
+        central(up, down) if both_ways else (up,),
+    )
     return deviation, np.hstack([linear, *moves]), np.hstack(left_open)
 
 
@@ -278,7 +288,11 @@ def _with_delay(theta: Theta, coefficient: int, size: float, sign: int) -> Theta
 def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
     """Scattering effects: effect to parameter and one sigma."""
     learned = evidence.healthy.scatter
-    return {name: (p.name, learned.get(name, p.healthy_sigma)) for name, p in SCATTERING.items()}
+    sizes = {}
+    for name, p in SCATTERING.items():
+        least = evidence.least_time_ms if p.is_time else 0.0
+        sizes[name] = p.name, max(learned.get(name, p.healthy_sigma), least)
+    return sizes
 
 
 # --- levels: one row for each that a cycle shows --------------------------------------------------

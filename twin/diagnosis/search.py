@@ -102,7 +102,7 @@ def search(
     tried = _fit_singles(evidence, judged, weights, alone, progress)
     singles = _ranked(evidence, judged, tried)
     healthy = _healthy(evidence, weights)
-    if not any(_worth(healthy, healthy, 0.0, candidate) for candidate in singles):
+    if not any(_worth(evidence, healthy, healthy, 0.0, candidate) for candidate in singles):
         return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
     for first in firsts:
@@ -116,7 +116,7 @@ def search(
         progress("asking cycles that nothing was fitted to")
         confirmed = _confirmed(evidence, fitted, current)
         chi2_without = healthy + weights.volume
-        if confirmed and _beats(chi2_without, confirmed, current.weights.volume):
+        if confirmed and _beats(evidence, chi2_without, confirmed, current.weights.volume):
             break
     else:
         return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
@@ -494,7 +494,7 @@ def _best_addition(
     candidates = with_times(evidence, judged, candidates)
     tried = _ranked(evidence, judged, fit(evidence, weights, candidates, best_only=True))
     for candidate in tried:
-        if _worth(current.healthy, found.chi2, found.chi2 - found.score, candidate):
+        if _worth(evidence, current.healthy, found.chi2, found.chi2 - found.score, candidate):
             return candidate
     return None
 
@@ -528,37 +528,46 @@ def _fitted_pairs(
     return [combined[i] for i in best if chi2[i] < found.chi2]
 
 
-def _worth(healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
+def _worth(evidence: Evidence, healthy: float, chi2: float, paid: float, fitted: Fitted) -> bool:
     """Whether a hypothesis gains enough over a smaller one, and all its causes are large enough."""
     scale = max(fitted.leftover**2, 1.0)
     gain = (chi2 - fitted.chi2) / scale - (fitted.score - fitted.chi2 + paid)
     enough = max(SIGNIFICANT, SHARE * (healthy - chi2) / scale)
     least = SMALLEST if len(fitted.hypothesis) == 1 else SMALLEST_MORE
-    return gain > enough and _smallest_size(fitted) >= least
+    return gain > enough and _smallest_size(evidence, fitted) >= least
 
 
-def _beats(alone: float, found: Fitted, volume: float) -> bool:
+def _beats(evidence: Evidence, alone: float, found: Fitted, volume: float) -> bool:
     """Whether causes are large enough and explain more than none, each by its own weights.
 
     ``alone`` is the chi-square without causes, with the log-determinant of its weights.
     """
     gain = (alone - found.chi2 - volume) / max(found.leftover**2, 1.0)
-    return gain - (found.score - found.chi2) > SIGNIFICANT and _smallest_size(found) >= SMALLEST
+    return (
+        gain - (found.score - found.chi2) > SIGNIFICANT
+        and _smallest_size(evidence, found) >= SMALLEST
+    )
 
 
-def _smallest_size(fitted: Fitted) -> float:
-    """The size of the smallest cause, in typical ones."""
-    return min(_sizes_of_causes(fitted))
+def _smallest_size(evidence: Evidence, fitted: Fitted) -> float:
+    """The size of the smallest cause, in typical ones of this unit."""
+    return min(_sizes_of_causes(evidence, fitted))
 
 
-def _sizes_of_causes(fitted: Fitted) -> list[float]:
-    """The size of each cause, in typical ones: that of its parameter farthest from neutral."""
+def _sizes_of_causes(evidence: Evidence, fitted: Fitted) -> list[float]:
+    """The size of each cause, in typical ones of this unit: that farthest from neutral."""
     first, sizes = 0, []
     for cause in fitted.hypothesis:
-        cause_parameters = parameters((cause,))
-        is_size = [not parameter.shapes for parameter in cause_parameters]
-        sizes.append(float(np.abs(fitted.x[first : first + len(cause_parameters)][is_size]).max()))
-        first += len(cause_parameters)
+        table = parameters((cause,))
+        of_cause = zip(table, fitted.x[first : first + len(table)], strict=True)
+        sizes.append(
+            max(
+                abs(float(x)) * p.typical / p.typical_on(evidence.theta)
+                for p, x in of_cause
+                if not p.shapes
+            )
+        )
+        first += len(table)
     return sizes
 
 
@@ -570,7 +579,7 @@ def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float)
             for left_out in range(len(found.hypothesis))
         ]
         best = min(fit(evidence, weights, without), key=lambda candidate: candidate.score)
-        if _worth(healthy, best.chi2, best.chi2 - best.score, found):
+        if _worth(evidence, healthy, best.chi2, best.chi2 - best.score, found):
             break
         found = best
     return found
@@ -597,7 +606,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         else:
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
-        sizes_found = _sizes_of_causes(found)
+        sizes_found = _sizes_of_causes(evidence, found)
         if (
             alternatives and min(sizes_found) < SMALLEST_MORE
         ):  # beside the others it became too small

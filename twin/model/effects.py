@@ -20,7 +20,14 @@ WEEKLY, SELDOM = 100.0, 0.1
 # model: 9 % rms over 11 sizes on rigs of the second world (tools/battery_second.py), less of what a
 # reading shows by itself.
 OTHER_EQUATIONS, READ_OFF = 0.08, 0.03
+# Suction (kg/s) and volume (m³) of a unit for which typical sizes are meant: a small gripper.
+USUAL_SUCTION, USUAL_VOLUME = 30.0 * SL_MIN, 150.0 * ML
 UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
+
+
+def is_of_volumes(unit: str) -> bool:
+    """Whether a unit is that of a flow or a volume: pressures show only ratios of these."""
+    return unit in ("sl/min", "ml")
 
 
 @dataclass(frozen=True)
@@ -56,8 +63,8 @@ class Parameter:
 
     @property
     def scales_with_volumes(self) -> bool:
-        """Whether it is a flow or a volume: pressures show only what it is beside the system's."""
-        return self.unit in ("sl/min", "ml")
+        """Whether it is a flow or a volume."""
+        return is_of_volumes(self.unit)
 
     @property
     def shapes(self) -> bool:
@@ -83,6 +90,12 @@ class Parameter:
         if self.ratio:
             return float(self.neutral(theta) * self.typical**steps)
         return self.neutral(theta) + steps * self.typical
+
+    def typical_on(self, theta: Theta) -> float:
+        """A change worth an alarm on a unit: of flows and volumes less if the unit is small."""
+        volume = theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME] + theta[c.VOLUME]
+        of_usual = {"sl/min": theta[c.SUCTION] / USUAL_SUCTION, "ml": volume / USUAL_VOLUME}
+        return self.typical * min(float(of_usual.get(self.unit, 1.0)), 1.0)
 
     def range(self, theta: Theta) -> tuple[float, float]:
         """Return the bounds of a change from neutral."""
