@@ -7,7 +7,6 @@ and delays. The fit starts from these and searches the range of all ejectors on 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -179,8 +178,13 @@ def commission(
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
     guesses = starts(guess, readings.meets, readings.grows, _into_hose(guess, readings))
-    fits = partial(_fit, used, free=free, progress=progress)
-    fitted, found_cycles, verdict = _best(samples, readings.noise, guesses, fits, progress)
+    fitted, found_cycles, verdict = _best(
+        samples,
+        readings.noise,
+        guesses,
+        lambda starting: _fit(used, starting, free, progress),
+        progress,
+    )
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
     fitted, remarks = _deciding(fitted, found_cycles, metered, readings)

@@ -135,6 +135,9 @@ def diagnose(
     beside = Unmodelled(evidence, searched_covariance.of(evidence.judged), hypothesis)
     odds = [beside.odds(number) for number in range(len(hypothesis))]
     probability_alone = 0.0 if hypothesis else beside.alone()
+    like_weather = None if hypothesis else beside_weather(evidence, healthy)
+    if like_weather:  # what the model has wrong of such weather is smooth, and recurs as well
+        probability_alone = min(probability_alone, LIKELY)
     likely = probability_alone > LIKELY or any(
         beside.is_large(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
         for number, cause_odds in enumerate(odds)
@@ -175,7 +178,7 @@ def diagnose(
         "baseline": before.figures,
         "extended": findings.after.figures,
         "gain": gain(before, findings.after),
-        "next_experiment": _odd_cycles(evidence, healthy) or beside_weather(evidence, healthy)
+        "next_experiment": _odd_cycles(evidence, healthy) or like_weather
         if findings.verdict == "consistent"
         else next_experiment(evidence, findings.searched, findings.mechanism),
     }
