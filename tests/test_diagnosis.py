@@ -576,8 +576,8 @@ def test_cycles_that_deviate_fall_into_both_parts_however_they_come(
     healthy = covariance(evidence)
     plain = answer_module.split(evidence, healthy)
     affected = set(plain[part])
-    chi2 = np.where(np.isin(evidence.judged, list(affected)), 6.0, 1.0)
-    monkeypatch.setattr(answer_module, "_left_by_cycle", lambda *_: chi2)
+    squares = np.where(np.isin(evidence.judged, list(affected)), 6.0, 1.0)
+    monkeypatch.setattr(answer_module, "_mean_squares", lambda *_: squares)
     monkeypatch.setattr(answer_module, "are_odd", lambda left: left < 0.0)
     fitted, held_out = answer_module.split(evidence, healthy)
     assert sorted(fitted + held_out) == evidence.judged
@@ -619,7 +619,7 @@ def test_a_consistent_log_names_cycles_that_are_not(
 
 
 @pytest.mark.parametrize(
-    ("chi2", "upper"),
+    ("squares", "upper"),
     [
         ([1.0, 1.1, 6.0, 0.9, 5.0, 1.2], [2, 4]),
         ([1.0, 1.3, 0.8, 0.9, 1.2, 1.1], []),
@@ -627,9 +627,9 @@ def test_a_consistent_log_names_cycles_that_are_not(
     ],
 )
 def test_two_groups_of_cycles_are_apart_where_both_have_some(
-    chi2: list[float], upper: list[int]
+    squares: list[float], upper: list[int]
 ) -> None:
-    assert np.flatnonzero(apart(np.array(chi2))).tolist() == upper
+    assert np.flatnonzero(apart(np.array(squares))).tolist() == upper
 
 
 def test_thresholds_that_come_and_go_are_found_by_the_levels() -> None:

@@ -25,7 +25,7 @@ from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
-from twin.diagnosis.residual_covariance import Covariance, Weights, covariance, on_one_day
+from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
@@ -399,7 +399,7 @@ def split(evidence: Evidence, healthy: Covariance) -> tuple[list[int], list[int]
     cycles = np.array(evidence.judged)
     odd = are_odd(_deviations(evidence, healthy))
     if not 2 <= np.count_nonzero(odd) <= FEW * len(odd):
-        odd = apart(_left_by_cycle(evidence, on_one_day(healthy).of(evidence.judged)))
+        odd = apart(_mean_squares(evidence))
         held_out = _held_out(cycles)
         if all(_in_both(cycles[odd == group], held_out) for group in (True, False)):
             odd[:] = False
@@ -413,6 +413,20 @@ def _deviations(evidence: Evidence, residual_covariance: Covariance) -> Floats:
         white(evidence, residual_covariance.of([cycle]), [HEALTHY]) for cycle in evidence.judged
     ]
     return np.array([np.mean(cycle_residuals**2) for cycle_residuals in residuals])  # pyright: ignore[reportReturnType]
+
+
+def _mean_squares(evidence: Evidence) -> Floats:
+    """Mean square of each judged cycle's deviation (mbar²) from the twin without causes.
+
+    In sigmas an effect in some cycles would hide: all cycles share what is unknown of the twin.
+    """
+    squares, bins = evidence.off([HEALTHY])[:, 0] ** 2, evidence.bins
+    return np.array(  # pyright: ignore[reportReturnType]
+        [
+            np.average(squares[bins.cycle == cycle], weights=bins.count[bins.cycle == cycle])
+            for cycle in evidence.judged
+        ]
+    )
 
 
 def _held_out(ordered: Ints) -> set[int]:

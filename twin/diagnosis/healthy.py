@@ -23,7 +23,7 @@ ROUNDS = 3
 FEWEST = 6  # cycles, to learn from one half and judge on the other
 LEAST_COMMON, LEAST_ALONE = 0.15, 0.1  # mbar
 ODD = 3.0  # times the median of cycles' chi-square, at which a cycle's chi-square is clipped
-APART = 2.0  # least ratio of chi-squares between two groups of cycles
+APART = 2.0  # least ratio of mean squares between two groups of cycles
 HIDDEN = 1.3  # model error before the fit, over the residual that the fit leaves of it
 LEAST_SCATTER, MOST_SCATTER = 0.2, 5.0  # bounds, over the usual size
 
@@ -104,13 +104,13 @@ def are_odd(chi2: Floats) -> Bools:
     return chi2 > ODD * np.median(chi2)
 
 
-def apart(chi2: Floats) -> Bools:
-    """Cycles above the largest gap in chi-square with two or more on either side; none if small."""
-    ordered = np.sort(chi2)
+def apart(squares: Floats) -> Bools:
+    """Cycles above the largest gap in ``squares`` that has two or more on either side."""
+    ordered = np.sort(squares)
     ratios = ordered[2:-1] / ordered[1:-2]
     if not len(ratios) or ratios.max() < APART:
-        return np.zeros(len(chi2), bool)
-    return np.asarray(chi2 >= ordered[2 + int(ratios.argmax())], bool)
+        return np.zeros(len(squares), bool)
+    return np.asarray(squares >= ordered[2 + int(ratios.argmax())], bool)
 
 
 def _learned(deviation: _HealthyDeviation, cycles: Sequence[int]) -> Healthy:

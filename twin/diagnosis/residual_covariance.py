@@ -180,13 +180,6 @@ def covariance(
     return replace(exact, day_mismatch=MISMATCH * explained_by_day(exact, off))
 
 
-def on_one_day(residual_covariance: Covariance) -> Covariance:
-    """The same without what the log's day leaves open: for cycles among each other."""
-    nothing = np.zeros_like(residual_covariance.day_mismatch)
-    another_day = residual_covariance.another_day[:, :0]
-    return replace(residual_covariance, another_day=another_day, day_mismatch=nothing)
-
-
 def opened_by_calibration(
     evidence: Evidence, opened: Floats, *, both_ways: bool = True
 ) -> tuple[Floats, Floats]:
