@@ -691,6 +691,28 @@ def test_what_is_likelier_in_place_of_a_cause_takes_it(
     assert search_module._likelier(evidence, found, [[], []]) is None
 
 
+def test_a_rival_is_scored_by_weights_about_itself() -> None:
+    """Weights about what was found forgive the error of that alone, so a rival looks poorer."""
+    evidence = with_leak().evidence
+    fitted, _ = answer_module.split(evidence, covariance(evidence))
+
+    def about(name: str) -> Any:
+        (p,) = EFFECTS[name].parameters
+        hypothesis: tuple[Cause, ...] = (Cause(name, {p.name: p.typical}),)
+        for _ in range(3):  # weights are about a size, which is fitted with them
+            hypothesis = _about(evidence, fitted, hypothesis).found.hypothesis
+        return _about(evidence, fitted, hypothesis)
+
+    leak, seepage = about("leakage"), about("porous_leakage")
+    _, itself = search_module._by_own_weights(evidence, fitted, leak, leak.found)
+    assert itself.score == pytest.approx(leak.found.score, rel=1e-3)
+    _, rival = search_module._by_own_weights(evidence, fitted, leak, seepage.found)
+    volumes = seepage.weights.volume - leak.weights.volume
+    assert rival.score == pytest.approx(seepage.found.score + volumes, rel=1e-3)
+    ((first, second),) = search_module._in_place([[leak.found, seepage.found]], leak.found, rival)
+    assert (first, second) == (rival, seepage.found)
+
+
 def test_a_cause_does_not_stand_where_a_better_one_does_not_hold_in_unseen_cycles(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

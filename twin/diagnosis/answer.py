@@ -581,7 +581,7 @@ def _parameters(
 
 
 def _relative_errors(p: Parameter, volumes_within: float) -> tuple[float, float]:
-    """What a size may be off at most (95 %), relative, toward zero and away, beyond the log's part.
+    """Relative errors (95 %) of a size, toward zero and away, beside what the log leaves open.
 
     A flow or volume is as many times larger or smaller as the system's volumes are than told.
     """

@@ -200,41 +200,37 @@ def _beside_rivals(
     """
     visited = set[frozenset[tuple[str, Course]]]()
     while True:
-        if any(cause.course == Course.STEP for cause in current.found.hypothesis):
-            timed = with_fine_onsets(evidence, current.judged, current.found.hypothesis)
-            (found,) = fit(evidence, current.weights, [timed])
-            current = replace(current, found=found)
+        current = _with_fine_steps(evidence, current)
         visited.add(current.found.kind)
         rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
         if _is_weather_alone(current.found):
             return _weather_or_rival(evidence, fitted, current, rivals[0])
         better = _likelier(evidence, current.found, rivals)
-        if better is None or better.kind in visited:
+        if better is None:
             break
+        if better.kind in visited:  # what was found took its place, by weights about itself
+            _, by_own_weights = _by_own_weights(evidence, fitted, current, better)
+            return current, _in_place(rivals, better, by_own_weights)
         residual_covariance = covariance(evidence, better.hypothesis)
         confirmed = _confirmed(
             evidence, fitted, replace(current, found=better, known=residual_covariance)
         )
         clearly = _is_clearly_better(better, current.found)
         if confirmed is better:
-            candidate = _about(evidence, fitted, better.hypothesis)
-            behind = _own_score(candidate) - _own_score(current)
-            by_own_weights = replace(candidate.found, score=current.found.score + behind)
+            candidate, by_own_weights = _by_own_weights(evidence, fitted, current, better)
             if clearly or _likelier(evidence, current.found, [[by_own_weights]]):
                 current = candidate
                 continue
-            return current, [
-                [by_own_weights if rival is better else rival for rival in rivals_of_cause]
-                for rivals_of_cause in rivals
-            ]
+            return current, _in_place(rivals, better, by_own_weights)
         if not (clearly or _is_weather_alone(better)):
             break
         if confirmed and stranger(better, current.found) in confirmed.effects:
             break
-        number = next(
-            number for number, rivals_of_cause in enumerate(rivals) if _has(rivals_of_cause, better)
+        remaining = tuple(
+            cause
+            for cause, of_cause in zip(current.found.hypothesis, rivals, strict=True)
+            if not _has(of_cause, better)
         )
-        remaining = current.found.hypothesis[:number] + current.found.hypothesis[number + 1 :]
         if not remaining:
             return None
         current = _about(evidence, fitted, remaining)
@@ -661,9 +657,32 @@ def _likelier(
     return None if best is found else best
 
 
-def _own_score(current: _Found) -> float:
-    """Score by weights about the causes themselves, which differ in their volume as well."""
-    return current.found.score + current.weights.volume
+def _with_fine_steps(evidence: Evidence, current: _Found) -> _Found:
+    """The same with the onset of every step searched to the row."""
+    if not any(cause.course == Course.STEP for cause in current.found.hypothesis):
+        return current
+    timed = with_fine_onsets(evidence, current.judged, current.found.hypothesis)
+    (found,) = fit(evidence, current.weights, [timed])
+    return replace(current, found=found)
+
+
+def _by_own_weights(
+    evidence: Evidence, fitted: Sequence[int], current: _Found, rival: Fitted
+) -> tuple[_Found, Fitted]:
+    """A rival refitted by weights about itself, and that fit with a score beside ``current``.
+
+    Each has its own weights, which differ in their volume as well.
+    """
+    candidate = _about(evidence, fitted, rival.hypothesis)
+    own = candidate.found.score + candidate.weights.volume
+    return candidate, replace(candidate.found, score=own - current.weights.volume)
+
+
+def _in_place(
+    rivals: Sequence[Sequence[Fitted]], rival: Fitted, other: Fitted
+) -> list[list[Fitted]]:
+    """The rivals of each cause with ``other`` in place of one of them."""
+    return [[other if element is rival else element for element in of_cause] for of_cause in rivals]
 
 
 def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
