@@ -14,7 +14,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.monitor.cycles import whole
-from twin.signals import Samples
+from twin.signals import Phase, Samples
 
 SECONDS = 60.0
 MOST_BYTES = 8  # of a row that is kept; one of SAMPLE and TICK has 61
@@ -56,6 +56,29 @@ def test_what_a_record_ties_together_moves_healthy_cycles_by_its_slope() -> None
     about = covariance(evidence, (Cause("suction_loss", {"loss": 5.0}),))
     assert (about.left_open == healthy.left_open).all()
     assert np.abs(about.beyond[:, : len(tied)][:, tied]).max() > 0.1
+
+
+def test_a_valve_can_act_before_its_command_is_seen() -> None:
+    """Commands that come a row late leave what a delay shorter by that row makes of it."""
+    samples, _ = rigs.recorded("test_rig", 12.0)
+    evidence = collect(rigs.config("test_rig"), [samples])
+    row, ms = 1e-3, 1e-3
+    delays = [c.RESPONSE, c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE, c.BLOW_OFF_RESPONSE_OFF]
+    soon = evidence.theta.copy()
+    soon[delays] = [0.4 * ms, 0.7 * ms, 0.2 * ms, 0.9 * ms]
+    before_command = soon.copy()
+    before_command[delays] -= row
+    late = evidence.ticks.copy()
+    suction = np.isin(late["phase"], (Phase.SUCTION, Phase.HOLD))
+    commands = np.where(suction, Phase.SUCTION, late["phase"])
+    for edge in np.flatnonzero(np.diff(commands)) + 1:
+        late["phase"][edge] = evidence.ticks["phase"][edge - 1]
+        late["level"][[edge, edge + 1]] = np.nan, evidence.ticks["level"][edge]
+    off = evidence.off([HEALTHY], [soon])
+    off_late = replace(evidence, ticks=late).off([HEALTHY], [before_command])
+    assert off_late == pytest.approx(off, abs=1e-3)
+    unlike = replace(evidence, ticks=late).off([HEALTHY], [soon])
+    assert np.abs(unlike - off).max() > 0.5
 
 
 class Reread:

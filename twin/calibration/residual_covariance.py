@@ -5,7 +5,6 @@ and does not: the fit must be no surer than with the mean cycle alone. So each o
 the error with n times its variance, which is equivalent.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from twin.model import theta as c
 from twin.model.effects import standing_for
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints
-from twin.monitor.scatter_covariance import SCATTERING
+from twin.monitor.scatter_covariance import SCATTERING, least_time_ms
 from twin.signals import MBAR, ML, MS
 
 FIRST_ERROR = 3.0 * MBAR  # Pa, of a model that has not been fitted
@@ -103,11 +102,8 @@ def _settled(bins: Bins) -> list[Ints]:
 
 
 def _scatter_changes(period: float) -> list[tuple[str, dict[str, float]]]:
-    """Each scattering effect with one sigma of its size; rows are ``period`` (s) apart.
-
-    A command is seen at the next row: so a time scatters at least uniformly over a row.
-    """
-    least = period / math.sqrt(12.0) / MS
+    """Each scattering effect with one sigma of its size; rows are ``period`` (s) apart."""
+    least = least_time_ms(period / MS)
     return [
         (name, {p.name: max(p.healthy_sigma, least) if p.is_time else p.healthy_sigma})
         for name, p in SCATTERING.items()

@@ -36,6 +36,7 @@ from twin.monitor.cycles import cut, figures
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.rows import drawn_rows, time_steps
+from twin.monitor.scatter_covariance import least_time_ms
 from twin.monitor.simulated_switching import Seen, seen
 from twin.monitor.surroundings import medians_of, surrounded
 from twin.monitor.switching_detector import Knees
@@ -43,6 +44,7 @@ from twin.monitor.uncertain_data import Shift, shifted
 from twin.quality import UNUSABLE, Quality
 from twin.signals import (
     MBAR,
+    MS,
     NS,
     SAMPLE,
     TICK,
@@ -57,11 +59,11 @@ from twin.signals import (
 
 OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
-SCAN_MS = 1.0  # cycle time of a PLC's fast task
 NEARBY = 0.1  # sigmas of a data set's uncertainty, within which the model is straight
 FASTEST, PIECE = 1, 100_000  # zlib's level, with which a row takes 4 bytes; rows of a piece
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
 
+Phases = npt.NDArray[np.uint8]
 Hypothesis = tuple[Cause, ...]
 HEALTHY: Hypothesis = ()
 Item = TypeVar("Item")
@@ -141,12 +143,8 @@ class Evidence:
 
     @cached_property
     def least_time_ms(self) -> float:
-        """One sigma of the time of a command: it is seen at the next row, if rows are slow.
-
-        A PLC reads pressure and commands in one scan, of a millisecond; then its time is known.
-        """
-        slower = max(sampling_ms(self.samples) ** 2 - SCAN_MS**2, 0.0)
-        return math.sqrt(slower / 12.0)
+        """One sigma of the time of a command, as far as the rows show it."""
+        return least_time_ms(sampling_ms(self.samples))
 
     @cached_property
     def cycle_of_row(self) -> Ints:
@@ -198,7 +196,8 @@ class Evidence:
             phase = self._phases(sensing[lane])
             rows = self._drawn(courses[lane], phase)
             level = self._levels(rows, courses[lane], sensing[lane])
-            expected = self._run(courses[lane], phase[rows], level, rows, kernel.COARSE_TOLERANCE)
+            driven, phase, level = self._given_sooner(courses[lane], phase[rows], level)
+            expected = self._run(driven, phase, level, rows, kernel.COARSE_TOLERANCE)
             off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
 
@@ -217,7 +216,7 @@ class Evidence:
         nearby, up, down = np.split(changes, 3, axis=1)
         return LeftOpen(nearby / NEARBY, up, down)
 
-    def _drawn(self, courses: Sequence[Schedule], phase: npt.NDArray[np.uint8]) -> Ints:
+    def _drawn(self, courses: Sequence[Schedule], phase: Phases) -> Ints:
         """Subsampled rows for interpolation of the pressure expected by these courses."""
         if self.terms:  # they need every row
             return np.arange(len(phase))
@@ -232,7 +231,7 @@ class Evidence:
     def _run(
         self,
         courses: Sequence[Schedule],
-        phase: npt.NDArray[np.uint8],
+        phase: Phases,
         level: Floats,
         rows: Ints,
         tolerance: float,
@@ -283,7 +282,7 @@ class Evidence:
             stretches.append((row, changed))
         return stretches
 
-    def _phases(self, sensing: Sequence[tuple["Sensing", ...]]) -> npt.NDArray[np.uint8]:
+    def _phases(self, sensing: Sequence[tuple["Sensing", ...]]) -> Phases:
         """Phases of all rows for which the nozzle would be seen to switch as it was.
 
         They are (rows, n), or (rows, 1) if they are the same for all.
@@ -310,6 +309,31 @@ class Evidence:
                 self._read_anew(rows, level[:, i], course)
         return level
 
+    def _given_sooner(
+        self, courses: Sequence[Schedule], phase: Phases, level: Floats
+    ) -> tuple[Sequence[Schedule], Phases, Floats]:
+        """Drives of the kernel, if valves of some courses act before their commands are seen.
+
+        Commands of these courses are a row sooner, and their delays longer by that. A negative
+        delay is thus exact, if it is shorter than a row. ``phase`` and ``level`` are at some rows,
+        those beside each command among them.
+        """
+        sooner = [min(theta[_DELAYS].min() for _, theta in course) < 0.0 for course in courses]
+        if not any(sooner):
+            return courses, phase, level
+        shape = (len(phase), len(courses))
+        phase, level = np.broadcast_to(phase, shape).copy(), np.broadcast_to(level, shape).copy()
+        commands = np.where(phase == Phase.HOLD, Phase.SUCTION, phase)
+        row, lane = np.nonzero((np.diff(commands, axis=0) != 0) & sooner)
+        phase[row, lane] = phase[row + 1, lane]
+        level[row, lane], level[row + 1, lane] = level[row + 1, lane], np.nan
+        period = sampling_ms(self.samples) * MS
+        driven = [
+            [(first, _after(theta, period)) for first, theta in course] if is_sooner else course
+            for course, is_sooner in zip(courses, sooner, strict=True)
+        ]
+        return driven, phase, level
+
     def _read_anew(self, rows: Ints, level: Floats, course: Schedule) -> None:
         """Correct levels at a cycle's start for coefficients of the sensor that change there."""
         for (_, before), (row, after) in pairwise(course):
@@ -317,7 +341,7 @@ class Evidence:
             if np.isfinite(level[at]) and self.ticks["phase"][row - 1] == Phase.IDLE:
                 level[at] = reading_of(sensed_of(level[at], before), after)
 
-    def _move(self, phase: npt.NDArray[np.uint8], sensing: Sequence["Sensing"]) -> None:
+    def _move(self, phase: Phases, sensing: Sequence["Sensing"]) -> None:
         """Move the switching of one hypothesis, in place."""
         for knee in self._knees:
             name = Phase(int(self.ticks["phase"][knee]))
@@ -395,8 +419,17 @@ class Sensing:
 
 
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
+_DELAYS = [c.RESPONSE, c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE, c.BLOW_OFF_RESPONSE_OFF]
 _SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.JET_FULL_AT, c.RAMP_DOWN]
 _SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]  # a drop along the line vanishes at a knee
+
+
+def _after(theta: Theta, period: float) -> Theta:
+    """Coefficients for commands that come ``period`` (s) sooner: all happens when it did."""
+    later = theta.copy()
+    later[_DELAYS] += period
+    later[c.CONTACT] += period * (theta[c.CONTACT] > 0.0)
+    return later
 
 
 def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:
@@ -606,7 +639,7 @@ def _binned(
     return binned(ticks["phase"], usable, starts)
 
 
-def _unsettled(phase: npt.NDArray[np.uint8], knees: Knees) -> npt.NDArray[np.bool_]:
+def _unsettled(phase: Phases, knees: Knees) -> npt.NDArray[np.bool_]:
     """Rows after a knee that was too close to the end of suction to be found well.
 
     Rows of the blow-off or idle after them count as well: its initial pressure is unknown.

@@ -24,7 +24,13 @@ from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
 from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
-from twin.monitor.scatter_covariance import SCATTERING, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.scatter_covariance import (
+    SCATTERING,
+    as_left,
+    from_cycle_to_cycle,
+    lasting,
+    model_error,
+)
 from twin.monitor.statistics import LEVELS
 from twin.signals import MS, Phase
 
@@ -91,9 +97,10 @@ class Covariance:
         unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
         unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
         mismatches = [self.mismatch[rows], self.day_mismatch[rows]]
+        of_cycles = _runs(bins.cycle[rows])
         groups = [
             self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle])
-            for of_cycle in _runs(bins.cycle[rows])
+            for of_cycle in of_cycles
         ]
         variance = np.concatenate([np.empty(0), *map(np.diag, groups)])
         variance += np.sum([error**2 for error in (common, *mismatches)], axis=0)
@@ -101,7 +108,11 @@ class Covariance:
         is_unseen = unsure**2 > UNSEEN**2 * variance[:, None]
         is_unseen[:, self.beyond.shape[1] :] |= self.of_weather
         unmeasured = _row_rms(np.sum(unsure**2 * is_unseen, axis=1), bins.count[rows], 0.0)
-        groups = [group * learned**2 for group in groups]
+        noise = evidence.noise**2 / bins.count[rows]
+        groups = [
+            as_left(group, learned, noise[of_cycle])
+            for group, of_cycle in zip(groups, of_cycles, strict=True)
+        ]
         moves, prior = _in_common(bins, rows, [learned * common, *mismatches], unsure)
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
@@ -274,7 +285,7 @@ def moved(
 def _with_delay(theta: Theta, coefficient: int, size: float, sign: int) -> Theta:
     """Coefficients with one delay longer by ``size`` ms, or shorter."""
     moved = theta.copy()
-    moved[coefficient] = max(moved[coefficient] + sign * size * MS, 0.0)
+    moved[coefficient] += sign * size * MS
     return moved
 
 

@@ -24,7 +24,13 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import UNCERTAIN_LAWS, ways
 from twin.monitor.rows import drawn_rows, elapsed, time_steps
-from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.scatter_covariance import (
+    SCATTER,
+    as_left,
+    from_cycle_to_cycle,
+    lasting,
+    model_error,
+)
 from twin.monitor.statistics import PER_UNIT
 from twin.monitor.surroundings import told
 from twin.signals import MBAR, Samples, Ticks, deviation
@@ -176,7 +182,8 @@ class _Cycle:
         goes_on = lasting(self.bins, self.first, alone)
         usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE)
         own = np.hypot(common, MISMATCH * self.off)
-        return usual * healthy.leftover**2 + fading(own, self.time, self.kind)
+        usual = as_left(usual, healthy.leftover, NOISE**2 / self.bins.count[self.first])
+        return usual + fading(own, self.time, self.kind)
 
 
 @dataclass(frozen=True)

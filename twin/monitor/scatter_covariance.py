@@ -1,5 +1,6 @@
 """Covariance over bins of the differences between cycles of a healthy ejector."""
 
+import math
 from collections.abc import Mapping
 from functools import cache
 
@@ -31,8 +32,17 @@ SCATTER: Mapping[str, tuple[str, float]] = {
 }
 KNEE_MBAR = 0.7  # sigma of the level found at a knee, to which the model is set
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
+SCAN_MS = 1.0  # cycle time of a PLC's fast task
 _HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
 _ERRORS = ("common_mbar", "alone_mbar")
+
+
+def least_time_ms(period_ms: float) -> float:
+    """One sigma of the time of a command in rows so far apart: it is seen at the next one.
+
+    A PLC reads pressure and commands in one scan, of a millisecond; then its time is known.
+    """
+    return math.sqrt(max(period_ms**2 - SCAN_MS**2, 0.0) / 12.0)
 
 
 def model_error(
@@ -89,3 +99,13 @@ def from_cycle_to_cycle(
     covariance = low_rank(moves, bins.cycle[rows]) + persistent
     add_independent(covariance, noise**2 / bins.count[rows])
     return covariance
+
+
+def as_left(covariance: Floats, leftover: float, noise: Floats) -> Floats:
+    """``covariance`` of a cycle scaled to the ``leftover`` (sigmas) that healthy cycles have.
+
+    Its part of ``noise`` (mbar², in each bin) is measured, so it does not shrink.
+    """
+    scaled = covariance * leftover**2
+    add_independent(scaled, max(1.0 - leftover**2, 0.0) * noise)
+    return scaled

@@ -28,7 +28,13 @@ from twin.monitor.model_bank import (
     suspects_of,
     variants,
 )
-from twin.monitor.scatter_covariance import SCATTER, from_cycle_to_cycle, lasting, model_error
+from twin.monitor.scatter_covariance import (
+    SCATTER,
+    as_left,
+    from_cycle_to_cycle,
+    lasting,
+    model_error,
+)
 from twin.monitor.simulated_switching import seen
 from twin.monitor.switching_detector import Knees
 from twin.signals import MBAR
@@ -150,6 +156,8 @@ class ScoreExtractor:
         suspects, larger, varied = np.split(changes, (count, count + len(DELAYS) * LARGER), axis=1)
         moves = self._moves(suspects[: len(cells.first)])
         covariance = from_cycle_to_cycle(bins, cells.first, cells.goes_on, moves, self.noise)
+        noise = self.noise**2 / bins.count[cells.first]
+        covariance = as_left(covariance, self.healthy.leftover, noise)
         return CycleResidual(
             cells.place,
             cells.kind,
@@ -158,7 +166,7 @@ class ScoreExtractor:
             suspects,
             larger,
             varied - suspects[:, self.variant_of],
-            _block_diagonal(covariance * self.healthy.leftover**2, self._sigmas[shown_levels] ** 2),
+            _block_diagonal(covariance, self._sigmas[shown_levels] ** 2),
             cells.common,
         )
 
