@@ -55,6 +55,7 @@ from twin.errors import ConfigError
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients, sensor_place
+from twin.model.parts import Cups
 from twin.quality import BREAK, Quality
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, bridged
 
@@ -356,6 +357,29 @@ def test_the_shipped_gripper_is_followed_through_its_hose() -> None:
     commissioned = commission(typed("gripper"), [samples], quiet)
     assert commissioned.verdict.word != "refused"
     assert commissioned.calibration.fitted.data.ejector.blow_off_sl_min < 90.0  # 60 in the rig
+
+
+@pytest.mark.parametrize(("left", "pushed"), [(3.0, True), (200.0, False)])
+def test_a_fit_starts_with_a_part_that_blow_off_pushes_off_where_no_vacuum_is_left(
+    left: float, pushed: bool
+) -> None:
+    """Behind a porous part the vacuum is gone before blow-off begins."""
+    cups = config_of(logged(SEED, KIND).truth.readable).data
+    one = np.zeros(1000, SAMPLE)
+    one["pressure"] = 1000.0 * MBAR
+    one["pressure"][300:600] = 500.0 * MBAR
+    one["pressure"][600:700] = (1000.0 - left) * MBAR
+    one["pressure"][710:720] = 1010.0 * MBAR
+    one["commands"][300:600], one["commands"][700:800] = Command.SUCTION, Command.BLOW_OFF
+    one["pressure"][700] = (1000.0 - left) * MBAR
+    record = np.tile(one, 4)
+    record["time_ns"] = np.arange(len(record)) * 1_000_000
+    record["sequence"] = np.arange(len(record))
+    pushes = read(record).pushes
+    shifts = {start.system.release_shift_mbar for start in starts(cups, np.nan, pushes=pushes)}
+    (release,) = {part.release_mbar for part in cups.system.parts if isinstance(part, Cups)}
+    assert max(shifts) == 0.0
+    assert min(shifts) == pytest.approx(-(release + 0.8 * 10.0) if pushed else 0.0, abs=2.0)
 
 
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:

@@ -80,6 +80,7 @@ RELIEVED, RELIEVES = 60.0, 0.5
 OTHER_BORES, CLOSES_QUICKLY = (2.0, 0.5), 0.4
 CREEPS = 0.3  # first guess of the share of the cups' yielding that comes later
 FAR_WEAKER = 0.5  # of the guess of a blow-off, below which a fit does not reach the weaker one
+PUSHED_OFF = 0.8  # pressure at which blow-off pushes the part off, over the highest; above ambient
 DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
@@ -177,7 +178,9 @@ def commission(
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
-    guesses = starts(guess, readings.meets, readings.grows, _into_hose(guess, readings))
+    guesses = starts(
+        guess, readings.meets, readings.grows, _into_hose(guess, readings), readings.pushes
+    )
     fitted, found_cycles, verdict = _best(
         samples,
         readings.noise,
@@ -499,7 +502,11 @@ def _into_hose(data: DataSet, readings: Readings) -> float:
 
 
 def starts(
-    data: DataSet, meets: float, grows: float = np.nan, into_hose: float = np.nan
+    data: DataSet,
+    meets: float,
+    grows: float = np.nan,
+    into_hose: float = np.nan,
+    pushes: float = np.nan,
 ) -> list[DataSet]:
     """Starts of a fit: ``data`` in variants that no fit reaches from each other.
 
@@ -507,14 +514,22 @@ def starts(
     whether cups spread or fold. Cups may be on the next part when suction is commanded, or meet it
     ``meets`` seconds later (NaN: not shown by the record). If the fall ``grows`` slowly (s), the
     jet may be the reason, or the sensor. If a blow-off ``into_hose`` (sl/min) is far weaker than
-    one that fills all, the pressure may show the hose alone.
+    one that fills all, the pressure may show the hose alone. If blow-off begins without vacuum and
+    ``pushes`` (Pa) above ambient, that may push the part off.
     """
     as_guessed = {key: getattr(data.ejector, key) for key in _blow_off(1.0)}
     flows = [as_guessed]
     if into_hose < FAR_WEAKER * data.ejector.blow_off_sl_min:
         flows.append(_blow_off(into_hose))
-    cups = sum(volume(part) for part in data.system.parts if isinstance(part, Cups)) / ML
-    leaves = ("in_blow_off", "after_blow_off") if cups else (data.system.part_leaves,)
+    of_cups = [part for part in data.system.parts if isinstance(part, Cups)]
+    cups = sum(map(volume, of_cups)) / ML
+    later = data.system.release_shift_mbar
+    leaves = [(data.system.part_leaves, later)]
+    if cups:
+        leaves = [("in_blow_off", later), ("after_blow_off", later)]
+    if cups and np.isfinite(pushes):
+        off_at = min(cup.release_mbar for cup in of_cups) + PUSHED_OFF * pushes / MBAR
+        leaves.append(("in_blow_off", -off_at))
     comes = meets / MS if np.isfinite(meets) else COMES
     waits = (0.0, comes) if cups else (0.0,)
     tables = data.model_dump()
@@ -532,7 +547,7 @@ def starts(
     if slow is not quick:
         inside.append((PORT_SHARES[0], usual_wall, quick))
     guesses = []
-    for flow, wait, leaving, place, (share, wall, jet) in product(
+    for flow, wait, (leaving, later), place, (share, wall, jet) in product(
         flows, waits, leaves, PLACES, inside
     ):
         shrinks, softness, stiff = wall
@@ -540,6 +555,7 @@ def starts(
         tables["system"].update(
             part_leaves=leaving, rim="turbulent", sensor_shift=place - configured_place
         )
+        tables["system"]["release_shift_mbar"] = later
         tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or total_volume))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
         tables["ejector"].update(jet, port_volume_ml=port, **flow)

@@ -81,6 +81,7 @@ class Readings:
     meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
     back_rate: float  # 1/s, steepest dp/dt over ambient after suction, nothing commanded
     blow_off_ends: float  # s after its command ends, when the pressure shows it; NaN: it does not
+    pushes: float  # Pa above ambient to which blow-off lifts a system without vacuum; NaN: others
     grows: float  # s, in which suction grows to its full strength; NaN if that does not show
     barometer: float = np.nan  # Pa, its median
     part: float = np.nan  # Pa, at which the ejector itself reports a part
@@ -173,6 +174,7 @@ def read(samples: Samples) -> Readings:
         meets=_meets(pressure, suctions, period, noise),
         back_rate=_back_rate(pressure, command_stretches, period, idle),
         blow_off_ends=_blow_off_ends(pressure, command_stretches, period, noise),
+        pushes=_pushes(pressure, command_stretches, idle, noise),
         grows=_grows(pressure, suctions, period, noise),
         barometer=told(samples).get("ambient", np.nan),
         part=_median([pascal for pascal, _ in parts]),
@@ -372,6 +374,18 @@ def _fill_rate(
                 rise = curve[ended[0]] - curve[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
+
+
+def _pushes(pressure: Floats, command_stretches: list[Stretch], idle: float, noise: float) -> float:
+    """Pressure above ``idle`` (Pa) that blow-off reaches if it begins without vacuum, or NaN."""
+    blow_offs = [
+        pressure[stretch.first : stretch.last]
+        for stretch in command_stretches
+        if stretch.command == Command.BLOW_OFF
+    ]
+    before = idle - _median([float(rows[0]) for rows in blow_offs])
+    above = _median([float(rows.max()) for rows in blow_offs]) - idle
+    return above if before < LEAST_VACUUM and above > max(CLEAR * noise, LEAST_TURN) else np.nan
 
 
 def _blow_off_ends(
