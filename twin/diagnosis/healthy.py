@@ -7,6 +7,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence
 from twin.diagnosis.residual_covariance import (
+    MEETS,
     Covariance,
     Weights,
     moved,
@@ -15,7 +16,7 @@ from twin.diagnosis.residual_covariance import (
 )
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
-from twin.monitor.healthy import Healthy, ModelError
+from twin.monitor.healthy import MEETS_MS, Healthy, ModelError
 from twin.monitor.scatter_covariance import FIRST_ERROR, SCATTER
 from twin.signals import MS
 
@@ -55,7 +56,8 @@ class _HealthyDeviation:
 
 def learned(evidence: Evidence) -> Healthy:
     """``evidence.healthy`` with the model's error and the scatter learned from its cycles."""
-    evidence = replace(evidence, another_day=False)
+    unlearned = evidence.healthy.model_copy(update={"meets_ms": MEETS_MS})
+    evidence = replace(evidence, another_day=False, healthy=unlearned)
     uncertain = [(shift.up, shift.down) for shift in evidence.uncertain]
     off, moves, opened = moved(evidence, HEALTHY, SCATTER, uncertain)
     deviation = _HealthyDeviation(evidence, off, moves, *opened_by_calibration(evidence, opened))
@@ -125,7 +127,8 @@ def _learned(deviation: _HealthyDeviation, cycles: Sequence[int]) -> Healthy:
             "bs,bs->b", deviation.moves, amplitudes[evidence.bins.cycle]
         )
         sizes = np.sqrt(amplitudes[cycles].var(axis=0, ddof=1) + spread[cycles].mean(axis=0))
-        sizes = np.clip(sizes[: len(SCATTER)], LEAST_SCATTER, MOST_SCATTER)
+        sizes = np.clip(sizes, LEAST_SCATTER, MOST_SCATTER)
+        meets, sizes = sizes[MEETS], sizes[: len(SCATTER)]
         healthy = healthy.model_copy(
             update={
                 "error": _errors(evidence, residual, cycles),
@@ -133,6 +136,7 @@ def _learned(deviation: _HealthyDeviation, cycles: Sequence[int]) -> Healthy:
                     name: float(size * factor)
                     for (name, (_, size)), factor in zip(SCATTER.items(), sizes, strict=True)
                 },
+                "meets_ms": float(meets * evidence.healthy.meets_ms),
             }
         )
     return healthy
@@ -149,6 +153,7 @@ def _amplitudes(
     known_sizes = [healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()]
     prior = np.ones(moves.shape[1])
     prior[: len(known_sizes)] = known_sizes
+    prior[MEETS] = healthy.meets_ms / deviation.evidence.healthy.meets_ms
     for cycle in cycles:
         weights = model.of([cycle], scattered=False)
         white = weights.white(np.column_stack([deviation.off, moves]))

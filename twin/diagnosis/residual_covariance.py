@@ -27,6 +27,7 @@ from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import (
     SCATTERING,
     as_left,
+    comes_on_part,
     from_cycle_to_cycle,
     lasting,
     model_error,
@@ -41,8 +42,10 @@ _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 ROW = math.sqrt(3.0)  # half a row, over the sigma of a time that is anywhere within a row
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
 KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
-# Columns of ``moved`` for that: knees of a cycle are independent.
-KNEES = [len(SCATTERING) + len(_CLOSES), -1]
+# Columns of ``moved`` for the time at which cups meet the part, and for knees: those of a cycle are
+# independent.
+MEETS = len(SCATTERING) + len(_CLOSES)
+KNEES = [MEETS + 1, -1]
 # Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
 # seen any of what another weather leaves open.
 UNSEEN = 3.0
@@ -243,20 +246,21 @@ def moved(
     """Deviation of a hypothesis (mbar), and its changes by scatter and by uncertainty, (bins, ·).
 
     Changes by scatter are in this order: each effect in ``sizes``; one sigma of the times at which
-    valves close, and of the knees; the second order of such times. A time is varied by half a row
-    where that is more: the response of an edge bends within it. Changes by uncertainty are those
-    of the ``uncertain`` data sets, first and second order. Without ``both_ways`` only the first of
-    each pair counts.
+    valves close and cups meet the part, and of the knees; the second order of such times. A time
+    is varied by half a row where that is more: the response of an edge bends within it. Changes by
+    uncertainty are those of the ``uncertain`` data sets, first and second order. Without
+    ``both_ways`` only the first of each pair counts.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
     delays = [(_OPENS[name], size) for name, (_, size) in sizes.items() if name in _OPENS]
     closing = max(CLOSING_MS, evidence.least_time_ms)
     times = [*delays, *((closes, closing) for closes in _CLOSES)]
+    times.append((c.CONTACT, evidence.healthy.meets_ms))
     steps = [max(sigma, ROW * evidence.least_time_ms) for _, sigma in times]
     steady = steady[: len(steady) - len(delays)]
     knee_shift = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
     variants = [
-        (_with_delay(evidence.theta, coefficient, step, sign), 0)
+        (_at_another_time(evidence.theta, coefficient, step, sign), 0)
         for sign in (1, -1)
         for (coefficient, _), step in zip(times, steps, strict=True)
     ]
@@ -282,10 +286,14 @@ def moved(
     return deviation, np.hstack([linear, *moves]), np.hstack(left_open)
 
 
-def _with_delay(theta: Theta, coefficient: int, size: float, sign: int) -> Theta:
-    """Coefficients with one delay longer by ``size`` ms, or shorter."""
+def _at_another_time(theta: Theta, coefficient: int, size: float, sign: int) -> Theta:
+    """Coefficients with one time later by ``size`` ms, or sooner."""
+    if coefficient == c.CONTACT and not comes_on_part(theta):
+        return theta
     moved = theta.copy()
     moved[coefficient] += sign * size * MS
+    if coefficient == c.CONTACT:
+        moved[coefficient] = max(moved[coefficient], np.finfo(float).eps)  # cups still meet it
     return moved
 
 

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from twin.settings import Settings
 
+MEETS_MS = 3.0  # one sigma of when cups come upon a part, unless it was learned. Chosen
 UNSEEN_LEVEL_MBAR = 3.0  # one sigma of a switching level that no cycle shows and somebody told
 SURE = 0.9  # that a scatter is no larger than is told of it
 NOT_COMMISSIONED = "not commissioned: causes are not named"
@@ -56,7 +57,8 @@ class Healthy(Settings):
     ``figures`` of a cycle; the model's ``error`` by kind of stretch; what differs from cycle to
     cycle (``scatter``: effect to one sigma of its size); in which ways the data set is
     ``uncertain`` (the lower Cholesky factor of its covariance, a row for each value).
-    ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows.
+    ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows, and
+    ``meets_ms`` of the time at which cups come upon the part, if that is after suction began.
     ``key_figures`` are those that have limits, in their own units.
     """
 
@@ -66,6 +68,7 @@ class Healthy(Settings):
     leftover: float = Field(1.0, gt=0.0)  # sigmas, by all this, that healthy cycles have
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
     unseen_level_mbar: float = Field(UNSEEN_LEVEL_MBAR, gt=0.0)
+    meets_ms: float = Field(MEETS_MS, gt=0.0)
     key_figures: Mapping[str, Scatter] = Field(default_factory=dict)
 
     @property

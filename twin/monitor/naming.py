@@ -27,13 +27,14 @@ from twin.monitor.rows import drawn_rows, elapsed, time_steps
 from twin.monitor.scatter_covariance import (
     SCATTER,
     as_left,
+    by_contact,
     from_cycle_to_cycle,
     lasting,
     model_error,
 )
 from twin.monitor.statistics import PER_UNIT
 from twin.monitor.surroundings import told
-from twin.signals import MBAR, Samples, Ticks, deviation
+from twin.signals import MBAR, MS, Samples, Ticks, deviation, sampling_ms
 
 STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
 FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
@@ -151,6 +152,7 @@ class _Cycle:
     first: Ints  # bins; what comes again counts once
     off: Floats  # mbar, measured less expected
     moves: Floats  # mbar by each change of the coefficients, (places, changes)
+    late: Floats  # mbar by a millisecond of the time of contact, (places, 0 or 1)
 
     @property
     def kind(self) -> Ints:
@@ -178,7 +180,7 @@ class _Cycle:
                 for effect in effects
             ]
         )
-        moves = self.moves * (scatter / typical)
+        moves = np.hstack([self.moves * (scatter / typical), self.late * healthy.meets_ms])
         goes_on = lasting(self.bins, self.first, alone)
         usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE)
         own = np.hypot(common, MISMATCH * self.off)
@@ -235,7 +237,9 @@ class _Expected:
             phase, off, self.drawn[here] - self.begin, expected, PER_UNIT
         )
         first = np.unique(bins.place, return_index=True)[1]
-        return _Cycle(bins, first, mean[first], derivatives(through[first])[1])
+        kept, period = self.drawn[here] - self.begin, sampling_ms(self.samples) * MS
+        late = by_contact(bins, first, kept, expected[:, 0], self.theta, period)
+        return _Cycle(bins, first, mean[first], derivatives(through[first])[1], late)
 
     def _expected(self, theta: Theta) -> Floats:
         """Pressure (Pa) at the drawn rows, (rows, n); ``theta`` is (coefficients, n)."""

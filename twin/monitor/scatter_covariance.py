@@ -7,11 +7,13 @@ from functools import cache
 import numpy as np
 
 from twin.inference.whitening import add_independent, fading, low_rank
+from twin.model import theta as c
 from twin.model.effects import EFFECTS, Parameter
 from twin.model.term import AGAIN, KINDS
+from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, warped
 from twin.monitor.healthy import ModelError
-from twin.signals import MS
+from twin.signals import MS, Phase
 
 # Effects whose sizes scatter from cycle to cycle in a healthy ejector. Delays stand last, as in the
 # columns of a diagnosis; the order of the others decides only how sums over them are rounded.
@@ -32,6 +34,7 @@ SCATTER: Mapping[str, tuple[str, float]] = {
 }
 KNEE_MBAR = 0.7  # sigma of the level found at a knee, to which the model is set
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
+ON_THE_PART_S = 5e-3  # cups that meet the part sooner than this after suction began are on it
 SCAN_MS = 1.0  # cycle time of a PLC's fast task
 _HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
 _ERRORS = ("common_mbar", "alone_mbar")
@@ -43,6 +46,30 @@ def least_time_ms(period_ms: float) -> float:
     A PLC reads pressure and commands in one scan, of a millisecond; then its time is known.
     """
     return math.sqrt(max(period_ms**2 - SCAN_MS**2, 0.0) / 12.0)
+
+
+def comes_on_part(theta: Theta) -> bool:
+    """Whether cups meet the part after suction began: when, differs from cycle to cycle."""
+    return bool(theta[c.CONTACT] > ON_THE_PART_S)
+
+
+def by_contact(
+    bins: Bins, rows: Ints, kept: Ints, expected: Floats, theta: Theta, period: float
+) -> Floats:
+    """Changes of the bins ``rows`` (mbar) by a millisecond of the time of contact, (bins, 0 or 1).
+
+    ``expected`` (mbar) is the twin's pressure at the rows ``kept``; rows are ``period`` seconds
+    apart. What follows contact comes later as a whole, to first order.
+    """
+    if not comes_on_part(theta):
+        return np.empty((len(rows), 0))
+    used = np.flatnonzero(bins.number >= 0)
+    first = used[np.searchsorted(bins.number[used], np.arange(len(bins.count)))]
+    begin, end = (np.interp(at, kept, expected) for at in (first, first + bins.count))
+    slope = (end - begin) / (bins.count * period)  # mbar/s
+    after = (bins.kind == Phase.SUCTION) & ((bins.since + bins.count) * period > theta[c.CONTACT])
+    later: Floats = -slope * after * MS
+    return later[rows, None]
 
 
 def model_error(

@@ -31,6 +31,7 @@ from twin.monitor.model_bank import (
 from twin.monitor.scatter_covariance import (
     SCATTER,
     as_left,
+    by_contact,
     from_cycle_to_cycle,
     lasting,
     model_error,
@@ -154,7 +155,12 @@ class ScoreExtractor:
         changes = np.concatenate([derivatives(bin_means / MBAR)[1], self._levels[shown_levels]])
         count = len(self.suspects)
         suspects, larger, varied = np.split(changes, (count, count + len(DELAYS) * LARGER), axis=1)
-        moves = self._moves(suspects[: len(cells.first)])
+        contact = by_contact(
+            bins, cells.first, drawn, expected[:, 0] / MBAR, self.theta, self.knees.period
+        )
+        moves = np.hstack(
+            [self._moves(suspects[: len(cells.first)]), contact * self.healthy.meets_ms]
+        )
         covariance = from_cycle_to_cycle(bins, cells.first, cells.goes_on, moves, self.noise)
         noise = self.noise**2 / bins.count[cells.first]
         covariance = as_left(covariance, self.healthy.leftover, noise)

@@ -7,10 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from pydantic.fields import FieldInfo
 
+from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 from twin.monitor.healthy import Healthy
+from twin.monitor.scatter_covariance import ON_THE_PART_S, comes_on_part
+from twin.signals import MS
 
 # One sigma, relative, of the type's values for how suction and end pressure follow the supply.
 SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
@@ -65,6 +68,9 @@ def scattered(theta: Theta, healthy: Healthy, rng: np.random.Generator) -> Theta
         moved = apply(theta, name, {parameter.name: parameter.neutral(theta) + sigma}) - theta
         changed = theta + float(rng.standard_normal()) * moved
         theta = np.where(theta >= 0.0, np.maximum(changed, 0.0), changed)
+    if comes_on_part(theta):
+        theta[c.CONTACT] += rng.standard_normal() * healthy.meets_ms * MS
+        theta[c.CONTACT] = max(theta[c.CONTACT], ON_THE_PART_S)
     return theta
 
 
