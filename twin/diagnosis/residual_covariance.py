@@ -42,10 +42,10 @@ _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 ROW = math.sqrt(3.0)  # half a row, over the sigma of a time that is anywhere within a row
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
 KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
-# Columns of ``moved`` for the time at which cups meet the part, and for knees: those of a cycle are
-# independent.
-MEETS = len(SCATTERING) + len(_CLOSES)
-KNEES = [MEETS + 1, -1]
+# Columns of ``moved``: for the knees, which are independent in a cycle, and for contact.
+_TIMES = len(_OPENS) + len(_CLOSES) + 2
+KNEES = [len(SCATTERING) + len(_CLOSES) + _TIMES * order for order in (0, 1)]
+MEETS = KNEES[0] + 1
 # Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
 # seen any of what another weather leaves open.
 UNSEEN = 3.0
@@ -246,26 +246,31 @@ def moved(
     """Deviation of a hypothesis (mbar), and its changes by scatter and by uncertainty, (bins, ·).
 
     Changes by scatter are in this order: each effect in ``sizes``; one sigma of the times at which
-    valves close and cups meet the part, and of the knees; the second order of such times. A time
-    is varied by half a row where that is more: the response of an edge bends within it. Changes by
-    uncertainty are those of the ``uncertain`` data sets, first and second order. Without
+    valves close, of the knees, and of contact with the part; the second order of such times. A
+    time is varied by half a row where that is more: the response of an edge bends within it.
+    Changes by uncertainty are those of the ``uncertain`` data sets, first and second order. Without
     ``both_ways`` only the first of each pair counts.
     """
     steady = [(*about, Cause(name, {key: size})) for name, (key, size) in sizes.items()]
     delays = [(_OPENS[name], size) for name, (_, size) in sizes.items() if name in _OPENS]
     closing = max(CLOSING_MS, evidence.least_time_ms)
     times = [*delays, *((closes, closing) for closes in _CLOSES)]
-    times.append((c.CONTACT, evidence.healthy.meets_ms))
+    knee = len(times)
+    if comes_on_part(evidence.theta):
+        times.append((c.CONTACT, evidence.healthy.meets_ms))
     steps = [max(sigma, ROW * evidence.least_time_ms) for _, sigma in times]
+    shares = np.insert(
+        [sigma / step for (_, sigma), step in zip(times, steps, strict=True)], knee, 1
+    )
     steady = steady[: len(steady) - len(delays)]
     knee_shift = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
-    variants = [
-        (_at_another_time(evidence.theta, coefficient, step, sign), 0)
-        for sign in (1, -1)
-        for (coefficient, _), step in zip(times, steps, strict=True)
-    ]
-    variants[len(times) : len(times)] = [(evidence.theta, knee_shift)]
-    variants.append((evidence.theta, -knee_shift))
+    variants = []
+    for sign in (1, -1):
+        of_times = [
+            (_at_another_time(evidence.theta, coefficient, sign * step), 0)
+            for (coefficient, _), step in zip(times, steps, strict=True)
+        ]
+        variants += [*of_times[:knee], (evidence.theta, sign * knee_shift), *of_times[knee:]]
     variants += [(up, 0) for up, _ in uncertain]
     variants += [(down, 0) for _, down in uncertain if both_ways]
     unchanged_count = len(steady) + 1
@@ -277,21 +282,17 @@ def moved(
     ends = np.cumsum([len(steady), *[len(times) + 1] * 2, len(uncertain)])
     deviation, changes = derivatives(off)
     linear, sooner, later, up, down = np.split(changes, ends, axis=1)
-    shares = np.array([sigma / step for (_, sigma), step in zip(times, steps, strict=True)] + [1.0])
     first, second = central(sooner, later)
-    moves, left_open = (
-        (first * shares, second * shares**2),
-        central(up, down) if both_ways else (up,),
-    )
-    return deviation, np.hstack([linear, *moves]), np.hstack(left_open)
+    never = np.zeros((len(deviation), _TIMES - len(shares)))
+    moves = np.hstack([linear, first * shares, never, second * shares**2, never])
+    left_open = central(up, down) if both_ways else (up,)
+    return deviation, moves, np.hstack(left_open)
 
 
-def _at_another_time(theta: Theta, coefficient: int, size: float, sign: int) -> Theta:
-    """Coefficients with one time later by ``size`` ms, or sooner."""
-    if coefficient == c.CONTACT and not comes_on_part(theta):
-        return theta
+def _at_another_time(theta: Theta, coefficient: int, later_ms: float) -> Theta:
+    """Coefficients with one time later."""
     moved = theta.copy()
-    moved[coefficient] += sign * size * MS
+    moved[coefficient] += later_ms * MS
     if coefficient == c.CONTACT:
         moved[coefficient] = max(moved[coefficient], np.finfo(float).eps)  # cups still meet it
     return moved

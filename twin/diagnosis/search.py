@@ -207,10 +207,9 @@ def _beside_rivals(
             return _weather_or_rival(evidence, fitted, current, rivals[0])
         better = _likelier(evidence, current.found, rivals)
         if better is None:
-            break
+            return current, rivals
         if better.kind in visited:  # what was found took its place, by weights about itself
-            _, by_own_weights = _by_own_weights(evidence, fitted, current, better)
-            return current, _in_place(rivals, better, by_own_weights)
+            return current, _by_two_pictures(evidence, fitted, current, rivals)
         residual_covariance = covariance(evidence, better.hypothesis)
         confirmed = _confirmed(
             evidence, fitted, replace(current, found=better, known=residual_covariance)
@@ -221,11 +220,10 @@ def _beside_rivals(
             if clearly or _likelier(evidence, current.found, [[by_own_weights]]):
                 current = candidate
                 continue
-            return current, _in_place(rivals, better, by_own_weights)
-        if not (clearly or _is_weather_alone(better)):
-            break
+        if confirmed is better or not (clearly or _is_weather_alone(better)):
+            return current, _by_two_pictures(evidence, fitted, current, rivals)
         if confirmed and stranger(better, current.found) in confirmed.effects:
-            break
+            return current, rivals
         remaining = tuple(
             cause
             for cause, of_cause in zip(current.found.hypothesis, rivals, strict=True)
@@ -234,7 +232,6 @@ def _beside_rivals(
         if not remaining:
             return None
         current = _about(evidence, fitted, remaining)
-    return current, rivals
 
 
 def _weather_or_rival(
@@ -678,11 +675,18 @@ def _by_own_weights(
     return candidate, replace(candidate.found, score=own - current.weights.volume)
 
 
-def _in_place(
-    rivals: Sequence[Sequence[Fitted]], rival: Fitted, other: Fitted
+def _by_two_pictures(
+    evidence: Evidence, fitted: Sequence[int], current: _Found, rivals: Sequence[Sequence[Fitted]]
 ) -> list[list[Fitted]]:
-    """The rivals of each cause with ``other`` in place of one of them."""
-    return [[other if element is rival else element for element in of_cause] for of_cause in rivals]
+    """The rivals; one that is better than what was found by its weights has to be so by its own."""
+
+    def judged(rival: Fitted) -> Fitted:
+        if rival.score >= current.found.score:
+            return rival
+        _, by_own_weights = _by_own_weights(evidence, fitted, current, rival)
+        return max(rival, by_own_weights, key=lambda candidate: candidate.score)
+
+    return [at_once(judged, of_cause) for of_cause in rivals]
 
 
 def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
@@ -713,8 +717,11 @@ def _rivals(
             ][:TRIED_PAIRS]
             timed = with_times(evidence, judged, tried)
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))
-        else:
-            fitted = [candidate for candidate in singles if candidate.effects != found.effects]
+        else:  # they were fitted with other weights
+            others = [candidate for candidate in singles if candidate.effects != found.effects]
+            alone = [found.hypothesis, *(candidate.hypothesis for candidate in others)]
+            _, *fitted = fit(evidence, weights, alone, best_only=True)
+            fitted.sort(key=lambda candidate: candidate.score)
         return [
             candidate
             for candidate in fitted
