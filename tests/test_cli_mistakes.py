@@ -43,6 +43,7 @@ NEEDED = {
     "figures trend": (),
     "figures counters": (),
     "figures autoset": (),
+    "figures forget": ("--older-than", "30"),
     "figures export": ("-o", "new.csv"),
     "alarms list": (),
     "alarms history": (),

@@ -382,6 +382,27 @@ def test_a_fit_starts_with_a_part_that_blow_off_pushes_off_where_no_vacuum_is_le
     assert min(shifts) == pytest.approx(-(release + 0.8 * 10.0) if pushed else 0.0, abs=2.0)
 
 
+@pytest.mark.parametrize("sooner", [0, 30])
+def test_a_fit_starts_with_suction_that_goes_on_as_blow_off_begins(sooner: int) -> None:
+    """Blow-off 10 ms after its command works against suction, which ends ``sooner`` or at 40 ms."""
+    rows = np.arange(1000)
+    rate = np.where(rows < 10, 0.0, np.where(rows < 40 - sooner, 1.5, 8.0))  # mbar/ms
+    one = np.zeros(2000, SAMPLE)
+    one["pressure"] = 1000.0 * MBAR
+    one["pressure"][500:1000] = 400.0 * MBAR
+    one["pressure"][1000:] = np.minimum(400.0 + np.cumsum(rate), 1000.0) * MBAR
+    one["commands"][500:1000], one["commands"][1000:1200] = Command.SUCTION, Command.BLOW_OFF
+    record = np.tile(one, 4)
+    record["time_ns"] = np.arange(len(record)) * 1_000_000
+    record["sequence"] = np.arange(len(record))
+    ends = read(record).suction_ends / MS
+    assert np.isnan(ends) if sooner else ends == pytest.approx(40.0, abs=2.0)
+    data = config_of(logged(SEED, KIND).truth.readable).data
+    closing = {start.ejector.response_off_ms for start in starts(data, np.nan, ends=ends * MS)}
+    assert len(closing) == (1 if sooner else 2)
+    assert sooner or max(closing) == pytest.approx(ends, abs=10.0)
+
+
 def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_are_cups() -> None:
     cups = config_of(logged(SEED, KIND).truth.readable).data
     tank = typed("test_rig").data

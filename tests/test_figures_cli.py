@@ -190,6 +190,20 @@ def test_deleted_cycles_are_named_and_still_counted(
     assert counted(figures("counters"))[0] == ["110", "110"]
 
 
+def test_an_ejector_that_no_run_watches_gives_its_old_cycles_away(
+    figures: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(10, 100)
+    with open_store("figures.sqlite") as store:
+        store.delete(UNIT, 10**18 + 5 * DAY, most=1000)
+    forgotten = figures("forget", "--older-than", "1")
+    assert forgotten == "50 cycles of gripper-01 deleted; the counters go on counting them\n"
+    assert counted(figures("counters"))[0] == ["100", "100"]
+    with pytest.raises(ConfigError, match="gripper-01"):
+        figures("trend", "--days", "1")
+    assert figures("forget", "--older-than", "1").startswith("0 cycles")
+
+
 def test_autoset_gives_what_stands_in_a_configuration(figures: Run) -> None:
     fill(10, 100)
     text = figures("autoset")

@@ -179,7 +179,12 @@ def commission(
     refuse_parted(Cycles.found(samples, guess))
     free = free_of(config, readings)
     guesses = starts(
-        guess, readings.meets, readings.grows, _into_hose(guess, readings), readings.pushes
+        guess,
+        readings.meets,
+        readings.grows,
+        _into_hose(guess, readings),
+        readings.pushes,
+        readings.suction_ends,
     )
     fitted, found_cycles, verdict = _best(
         samples,
@@ -507,6 +512,7 @@ def starts(
     grows: float = np.nan,
     into_hose: float = np.nan,
     pushes: float = np.nan,
+    ends: float = np.nan,
 ) -> list[DataSet]:
     """Starts of a fit: ``data`` in variants that no fit reaches from each other.
 
@@ -515,7 +521,8 @@ def starts(
     ``meets`` seconds later (NaN: not shown by the record). If the fall ``grows`` slowly (s), the
     jet may be the reason, or the sensor. If a blow-off ``into_hose`` (sl/min) is far weaker than
     one that fills all, the pressure may show the hose alone. If blow-off begins without vacuum and
-    ``pushes`` (Pa) above ambient, that may push the part off.
+    ``pushes`` (Pa) above ambient, that may push the part off. Suction may go on for a time that
+    ``ends`` (s) after blow-off was commanded.
     """
     as_guessed = {key: getattr(data.ejector, key) for key in _blow_off(1.0)}
     flows = [as_guessed]
@@ -546,6 +553,9 @@ def starts(
     ]
     if slow is not quick:
         inside.append((PORT_SHARES[0], usual_wall, quick))
+    if np.isfinite(ends):
+        late = quick | {"response_off_ms": max(ends / MS - SOONEST_MS, SOONEST_MS)}
+        inside += [(share, usual_wall, late) for share in PORT_SHARES]
     guesses = []
     for flow, wait, (leaving, later), place, (share, wall, jet) in product(
         flows, waits, leaves, PLACES, inside

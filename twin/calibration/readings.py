@@ -46,6 +46,7 @@ OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
 OPENED_FROM, OPENED_TO = 0.6, 0.85  # part of an idle in which an opened system is at ambient
 # A blow-off is steady in its last milliseconds, or is not; its valve closes within the others.
 STEADY_MS, ENDS_MS = 20.0, 150.0
+SUDDEN = 2.0  # times as steep as before: suction has ended, against which blow-off worked
 STILL = 3.0  # sigmas by which the pressure of an opened system may move in that time
 
 
@@ -81,6 +82,7 @@ class Readings:
     meets: float  # s after suction is commanded, when open cups meet a part; NaN if they have one
     back_rate: float  # 1/s, steepest dp/dt over ambient after suction, nothing commanded
     blow_off_ends: float  # s after its command ends, when the pressure shows it; NaN: it does not
+    suction_ends: float  # s after blow-off takes over from suction, if suction goes on; or NaN
     pushes: float  # Pa above ambient to which blow-off lifts a system without vacuum; NaN: others
     grows: float  # s, in which suction grows to its full strength; NaN if that does not show
     barometer: float = np.nan  # Pa, its median
@@ -174,6 +176,7 @@ def read(samples: Samples) -> Readings:
         meets=_meets(pressure, suctions, period, noise),
         back_rate=_back_rate(pressure, command_stretches, period, idle),
         blow_off_ends=_blow_off_ends(pressure, command_stretches, period, noise),
+        suction_ends=_suction_ends(pressure, command_stretches, period, noise),
         pushes=_pushes(pressure, command_stretches, idle, noise),
         grows=_grows(pressure, suctions, period, noise),
         barometer=told(samples).get("ambient", np.nan),
@@ -374,6 +377,30 @@ def _fill_rate(
                 rise = curve[ended[0]] - curve[begun[0]]
                 rates.append(rise / ((ended[0] - begun[0]) * period) / top)
     return _median(rates)
+
+
+def _suction_ends(
+    pressure: Floats, command_stretches: list[Stretch], period: float, noise: float
+) -> float:
+    """Time (s) until the pressure rises most, where blow-off is commanded as suction ends.
+
+    NaN if it does not rise slowly before: then suction has ended as blow-off begins.
+    """
+    width, rows = max(round(STEEP_MS * MS / period), 2), round(ENDS_MS * MS / period)
+    times, blow_offs = [], 0
+    for previous, stretch in pairwise(command_stretches):
+        if previous.command != Command.SUCTION or stretch.command != Command.BLOW_OFF:
+            continue
+        blow_offs += 1
+        curve = pressure[stretch.first : min(stretch.last, stretch.first + rows)]
+        risen = np.flatnonzero(curve - curve[0] > max(CLEAR * noise, LEAST_TURN))
+        if len(curve) > width and len(risen):
+            rise = curve[width:] - curve[:-width]
+            begins, steepest = int(risen[0]), int(np.argmax(rise))
+            before = (curve[steepest] - curve[0]) / max(steepest - begins, 1) * width
+            if steepest - begins > width and rise[steepest] > SUDDEN * before:
+                times.append(steepest * period)
+    return _median(times) if len(times) > 0.5 * blow_offs else float("nan")
 
 
 def _pushes(pressure: Floats, command_stretches: list[Stretch], idle: float, noise: float) -> float:

@@ -242,6 +242,36 @@ def counters(
 
 
 @figures_app.command()
+def forget(
+    older_than: Annotated[
+        float,
+        typer.Option(metavar="DAYS", callback=not_negative, help="Delete what is older."),
+    ],
+    config: ConfigFile = None,
+    unit: UnitId = "",
+    figures: Url = "",
+) -> None:
+    """Delete old cycles of an ejector, as a run does by [figures] keep_days.
+
+    It is for an ejector that no run watches any more. The counters go on counting them.
+    """
+    from twin.cli.console import status
+    from twin.figures.retention import forget as forget_cycles
+    from twin.instants import DAY_NS
+
+    with _open(
+        figures, config, write=False
+    ) as store:  # which makes no database where there is none
+        chosen = chosen_unit(store, config, unit)
+    with _open(figures, config, write=True) as store, status() as say:
+        before_ns = time.time_ns() - round(older_than * DAY_NS)
+        deleted = forget_cycles(
+            store, chosen, before_ns, lambda count: say(f"{count} cycles deleted")
+        )
+    print(f"{deleted} cycles of {chosen.id} deleted; the counters go on counting them")
+
+
+@figures_app.command()
 def autoset(
     config: ConfigFile = None,
     unit: UnitId = "",

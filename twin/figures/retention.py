@@ -13,6 +13,18 @@ PORTION = 1000  # rows of one transaction, for which others wait
 LOOK_S = 60.0  # interval at which the database is checked, once no old cycles are left
 
 
+def forget(store: Store, unit: Unit, before_ns: int, progress: Callable[[int], None]) -> int:
+    """Delete all cycles of a unit received before ``before_ns`` (UTC); returns how many.
+
+    ``progress`` gets how many are deleted so far. Who stops it has deleted whole portions.
+    """
+    deleted = 0
+    while rows := store.delete(unit, before_ns, PORTION):
+        deleted += rows
+        progress(deleted)
+    return deleted
+
+
 @dataclass
 class Retention:
     """Deletes cycles that are older than ``days``; ``say`` reports the first time and failures.
