@@ -709,8 +709,13 @@ def test_a_rival_is_scored_by_weights_about_itself() -> None:
     _, rival = search_module._by_own_weights(evidence, fitted, leak, seepage.found)
     volumes = seepage.weights.volume - leak.weights.volume
     assert rival.score == pytest.approx(seepage.found.score + volumes, rel=1e-3)
-    ((first, second),) = search_module._in_place([[leak.found, seepage.found]], leak.found, rival)
-    assert (first, second) == (rival, seepage.found)
+    # One that looks better by the leak's weights counts by its own; what looks poorer stays.
+    better = replace(seepage.found, score=leak.found.score - 1.0)
+    poorer = replace(seepage.found, score=leak.found.score + 1.0)
+    ((first, second),) = search_module._by_two_pictures(evidence, fitted, leak, [[better, poorer]])
+    assert first.score == pytest.approx(max(rival.score, better.score), rel=1e-3)
+    assert first.score > better.score
+    assert second is poorer
 
 
 def test_a_cause_does_not_stand_where_a_better_one_does_not_hold_in_unseen_cycles(
