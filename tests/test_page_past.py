@@ -125,7 +125,8 @@ def test_presets_beyond_the_ring_end_now_and_a_gap_is_shown(logged: Site) -> Non
         expect(page.locator("#window")).to_have_value(value)
     loaded(page)
     gaps = page.evaluate("past.curve.gaps")
-    assert [round(end - begin, -2) for begin, end in gaps][-1] == AGO_S - 600
+    begin, end = gaps[-1]  # it grows while other tests run beside the live ejector's
+    assert end - begin == pytest.approx(AGO_S - 600, abs=300)
     assert highest(page) == pytest.approx(PEAK_MBAR)  # of one row, in columns of half a minute
     page.select_option("#window", "today")
     assert page.evaluate("there(live.chart.range()[0]).getHours()") == 0 or span(page) <= 60.1
