@@ -862,6 +862,17 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
         expect(page.locator(dialog)).to_be_hidden()
 
 
+@pytest.mark.needs("axe")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site, scheme: str) -> None:
+    site.run.suck(2.0)
+    page = site.open("", "phone", color_scheme=scheme, bypass_csp=True)
+    expect(page.locator("#measured")).to_have_text("600")
+    site.runs.pop().close()
+    expect(page.locator(".live")).to_have_class(re.compile(r"\bstale\b"))
+    assert violations(page) == []
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None:
     site.run.leak()
