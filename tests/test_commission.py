@@ -398,7 +398,9 @@ def test_a_fit_starts_with_suction_that_goes_on_as_blow_off_begins(sooner: int) 
     ends = read(record).suction_ends / MS
     assert np.isnan(ends) if sooner else ends == pytest.approx(40.0, abs=2.0)
     data = config_of(logged(SEED, KIND).truth.readable).data
-    closing = {start.ejector.response_off_ms for start in starts(data, np.nan, ends=ends * MS)}
+    closing = {
+        start.ejector.response_off_ms for start in starts(data, np.nan, suction_ends=ends * MS)
+    }
     assert len(closing) == (1 if sooner else 2)
     assert sooner or max(closing) == pytest.approx(ends, abs=10.0)
 

@@ -258,10 +258,10 @@ def test_the_default_is_a_file_beside_the_configuration(tmp_path: Path) -> None:
     config.write_text("")
     document = Document.read(config)
     with pytest.raises(SourceError, match="no such figure database"):
-        open_chosen("", document, write=False)
-    with open_chosen("", document, write=True) as store:
+        open_chosen("", document, create=False)
+    with open_chosen("", document, create=True) as store:
         assert store.name == str(tmp_path / FILE)
-    with open_chosen("", document, write=False) as store:
+    with open_chosen("", document, create=False) as store:
         assert store.units() == []
 
 
@@ -269,9 +269,9 @@ def test_a_configuration_names_a_file_from_its_own_folder(tmp_path: Path) -> Non
     config = tmp_path / "cell.toml"
     config.write_text('[figures]\nurl = "kept/figures.sqlite"\n')
     (tmp_path / "kept").mkdir()
-    with open_chosen("", Document.read(config), write=True) as store:
+    with open_chosen("", Document.read(config), create=True) as store:
         assert store.name == str(tmp_path / "kept" / "figures.sqlite")
-    with open_chosen(str(tmp_path / "other.sqlite"), Document.read(config), write=True) as store:
+    with open_chosen(str(tmp_path / "other.sqlite"), Document.read(config), create=True) as store:
         assert store.name == str(tmp_path / "other.sqlite")
 
 

@@ -5,12 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from calibrations import quiet
+from second_rigs import config_of, samples_of
+from second_world.draw import draw_rig
+from second_world.records import record
 
+from twin.calibration.commission import commission
+from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.healthy import learned, usual_leftover
 from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
-from twin.monitor.scatter_covariance import as_left, by_contact
+from twin.monitor.bins import Floats, binned
+from twin.monitor.scatter_covariance import by_contact, from_cycle_to_cycle, lasting
+from twin.monitor.uncertain_data import scattered
 from twin.signals import MBAR, MS, Phase
 
 
@@ -26,12 +34,17 @@ def test_one_odd_cycle_does_not_make_all_as_odd() -> None:
 
 
 def test_what_is_left_shrinks_by_what_healthy_cycles_show_but_noise_does_not() -> None:
-    noise = np.array([0.04, 0.01])
-    scatter = np.array([[0.9, 0.3], [0.3, 0.5]])
-    shrunk = as_left(scatter + np.diag(noise), 0.5, noise)
-    assert shrunk == pytest.approx(0.25 * scatter + np.diag(noise))
-    widened = as_left(scatter + np.diag(noise), 2.0, noise)
-    assert widened == pytest.approx(4.0 * (scatter + np.diag(noise)))
+    bins = binned(np.full(200, Phase.IDLE, np.uint8), np.ones(200, bool), np.zeros(1, np.int64))
+    rows = np.arange(len(bins.count))
+    moves = np.random.default_rng(1).normal(size=(len(rows), 3))
+    noise = np.diag(0.3**2 / bins.count)
+    persistent = lasting(bins, rows, np.full(len(rows), 0.4))
+
+    def scaled(leftover: float) -> Floats:
+        return from_cycle_to_cycle(bins, rows, persistent, moves, 0.3, leftover)
+
+    assert scaled(0.5) == pytest.approx(0.25 * (scaled(1.0) - noise) + noise)
+    assert scaled(2.0) == pytest.approx(4.0 * scaled(1.0))
 
 
 def _of_contact(jitter_ms: float, seed: int) -> Evidence:
@@ -84,3 +97,44 @@ def test_what_follows_contact_comes_later_as_a_whole() -> None:
     on_the_part = evidence.theta.copy()
     on_the_part[c.CONTACT] = 0.0
     assert by_contact(bins, here, rows, expected, on_the_part, MS).shape == (len(here), 0)
+
+
+def test_a_rig_of_another_world_that_meets_the_part_late_is_healthy() -> None:
+    """Cups come upon the part 60 ms after suction began; one sigma of that is 2 ms."""
+    rig = draw_rig(198100, "gripper")
+    vessel = replace(rig.vessel, contact_delay=0.06, contact_jitter=2e-3)
+    sensor = replace(rig.sensor, cadence_ms=1, step=5.0)  # coarse steps are another matter
+    rig = replace(rig, vessel=vessel, sensor=sensor)
+    first, second = record(rig, 1, 12), record(rig, 2, 12)
+    config = config_of(first.truth.readable)
+    commissioned = commission(config, [samples_of(first)], quiet)
+    healthy = commissioned.calibration.healthy
+    assert commissioned.verdict.word == "good"
+    assert 0.7 < healthy.meets_ms < 6.0
+
+    def verdict(meets_ms: float) -> str:
+        known = healthy.model_copy(update={"meets_ms": meets_ms})
+        unit = replace(
+            config,
+            data=commissioned.calibration.fitted.data,
+            monitor=config.monitor.model_copy(update={"healthy": known}),
+        )
+        return str(diagnose(unit, [samples_of(second)], "log", quiet).json["verdict"])
+
+    assert verdict(healthy.meets_ms) == "consistent"
+    assert verdict(1e-6) == "unlisted"
+
+
+def test_a_drawn_cycle_meets_the_part_at_another_time_and_what_it_is_drawn_from_stays() -> None:
+    healthy = rigs.config("gripper").monitor.healthy.model_copy(
+        update={"meets_ms": 2.0, "scatter": {}}
+    )
+    theta = rigs.theta("gripper").copy()
+    theta[c.CONTACT] = 60.0 * MS
+    rng = np.random.default_rng(5)
+    times = [scattered(theta, healthy, rng)[c.CONTACT] / MS for _ in range(200)]
+    assert theta[c.CONTACT] == 60.0 * MS
+    assert np.mean(times) == pytest.approx(60.0, abs=1.0)
+    assert np.std(times) == pytest.approx(2.0, rel=0.3)
+    theta[c.CONTACT] = 0.0  # cups are on the part
+    assert scattered(theta, healthy, rng)[c.CONTACT] == 0.0

@@ -12,13 +12,13 @@ from twin.settings import Document
 FILE = "alarms.sqlite"
 
 
-def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
+def open_chosen(named: str, document: Document | None, *, create: bool) -> Store:
     """Open the database named on the command line, else in the configuration, else the default.
 
     The default is a file beside the configuration; without a configuration, in the current folder.
     Only a run creates the file; SourceError if there is none to read.
     """
-    return open_store(named or place_of(document), create=write)
+    return open_store(named or place_of(document), create=create)
 
 
 def place_of(document: Document | None) -> URL:

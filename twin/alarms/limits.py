@@ -207,7 +207,7 @@ def limits_in_force(config: Config) -> UnitLimits:
     if not config.document.section(AlarmSettings, "alarms").keep:
         return configured
     try:
-        with open_chosen("", config.document, write=False) as store:
+        with open_chosen("", config.document, create=False) as store:
             return configured.after(store.limit_changes(Unit(config.asset.type, config.asset.id)))
     except SourceError:  # before the first run there is no database
         return configured

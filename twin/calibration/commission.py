@@ -80,7 +80,7 @@ RELIEVED, RELIEVES = 60.0, 0.5
 OTHER_BORES, CLOSES_QUICKLY = (2.0, 0.5), 0.4
 CREEPS = 0.3  # first guess of the share of the cups' yielding that comes later
 FAR_WEAKER = 0.5  # of the guess of a blow-off, below which a fit does not reach the weaker one
-PUSHED_OFF = 0.8  # pressure at which blow-off pushes the part off, over the highest; above ambient
+PUSHED_OFF = 0.8  # of the highest pressure above ambient: there blow-off pushes a part off
 DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
@@ -181,10 +181,10 @@ def commission(
     guesses = starts(
         guess,
         readings.meets,
-        readings.grows,
-        _into_hose(guess, readings),
-        readings.pushes,
-        readings.suction_ends,
+        grows=readings.grows,
+        into_hose=_into_hose(guess, readings),
+        pushes=readings.pushes,
+        suction_ends=readings.suction_ends,
     )
     fitted, found_cycles, verdict = _best(
         samples,
@@ -512,7 +512,7 @@ def starts(
     grows: float = np.nan,
     into_hose: float = np.nan,
     pushes: float = np.nan,
-    ends: float = np.nan,
+    suction_ends: float = np.nan,
 ) -> list[DataSet]:
     """Starts of a fit: ``data`` in variants that no fit reaches from each other.
 
@@ -520,9 +520,9 @@ def starts(
     whether cups spread or fold. Cups may be on the next part when suction is commanded, or meet it
     ``meets`` seconds later (NaN: not shown by the record). If the fall ``grows`` slowly (s), the
     jet may be the reason, or the sensor. If a blow-off ``into_hose`` (sl/min) is far weaker than
-    one that fills all, the pressure may show the hose alone. If blow-off begins without vacuum and
-    ``pushes`` (Pa) above ambient, that may push the part off. Suction may go on for a time that
-    ``ends`` (s) after blow-off was commanded.
+    one that fills all, the pressure may show the hose alone. If no vacuum is left as blow-off
+    begins, it may be what pushes the part off, up to ``pushes`` (Pa) above ambient. Suction may go
+    on beside blow-off until ``suction_ends`` (s after its command).
     """
     as_guessed = {key: getattr(data.ejector, key) for key in _blow_off(1.0)}
     flows = [as_guessed]
@@ -530,10 +530,10 @@ def starts(
         flows.append(_blow_off(into_hose))
     of_cups = [part for part in data.system.parts if isinstance(part, Cups)]
     cups = sum(map(volume, of_cups)) / ML
-    later = data.system.release_shift_mbar
-    leaves = [(data.system.part_leaves, later)]
+    shift = data.system.release_shift_mbar
+    leaves = [(data.system.part_leaves, shift)]
     if cups:
-        leaves = [("in_blow_off", later), ("after_blow_off", later)]
+        leaves = [("in_blow_off", shift), ("after_blow_off", shift)]
     if cups and np.isfinite(pushes):
         off_at = min(cup.release_mbar for cup in of_cups) + PUSHED_OFF * pushes / MBAR
         leaves.append(("in_blow_off", -off_at))
@@ -553,19 +553,17 @@ def starts(
     ]
     if slow is not quick:
         inside.append((PORT_SHARES[0], usual_wall, quick))
-    if np.isfinite(ends):
-        late = quick | {"response_off_ms": max(ends / MS - SOONEST_MS, SOONEST_MS)}
-        inside += [(share, usual_wall, late) for share in PORT_SHARES]
+    if np.isfinite(suction_ends):
+        goes_on = quick | {"response_off_ms": max(suction_ends / MS - SOONEST_MS, SOONEST_MS)}
+        inside += [(share, usual_wall, goes_on) for share in PORT_SHARES]
     guesses = []
-    for flow, wait, (leaving, later), place, (share, wall, jet) in product(
+    for flow, wait, (leaving, shift), place, (share, wall, jet) in product(
         flows, waits, leaves, PLACES, inside
     ):
         shrinks, softness, stiff = wall
         port = share * total_volume
-        tables["system"].update(
-            part_leaves=leaving, rim="turbulent", sensor_shift=place - configured_place
-        )
-        tables["system"]["release_shift_mbar"] = later
+        tables["system"].update(part_leaves=leaving, release_shift_mbar=shift, rim="turbulent")
+        tables["system"].update(sensor_shift=place - configured_place)
         tables["system"].update(part_meets_ms=wait, shrinks_ml=shrinks * (cups or total_volume))
         tables["system"].update(softness=softness, stiff_mbar=stiff)
         tables["ejector"].update(jet, port_volume_ml=port, **flow)

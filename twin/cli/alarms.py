@@ -331,7 +331,7 @@ def alarms_of(
     from twin.assets.unit import Unit
 
     parse_url(alarm_settings.url, ALARM_DATABASE)
-    open_database = partial(open_chosen, "", document, write=True)
+    open_database = partial(open_chosen, "", document, create=True)
     keeper = Keeper(open_database, Unit(settings.asset.type, settings.asset.id), say)
     return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper, time.monotonic_ns)
 
@@ -358,7 +358,7 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
     unit = Unit(settings.asset.type, settings.asset.id)
 
     def acknowledge(alarm: str, user: str) -> None:
-        with open_chosen("", settings.document, write=True) as store:
+        with open_chosen("", settings.document, create=True) as store:
             store.ask(unit, alarm, Deed.ACKNOWLEDGED, user)
 
     return acknowledge
@@ -381,7 +381,7 @@ def _document(config: Path | None) -> "Document | None":
 def _open(url: str, config: Path | None) -> "Store":
     from twin.alarms.database_url import open_chosen
 
-    store = open_chosen(url, _document(config), write=False)
+    store = open_chosen(url, _document(config), create=False)
     print(f"alarm database: {store.name}", file=sys.stderr)
     return store
 

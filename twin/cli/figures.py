@@ -106,7 +106,7 @@ def show(
             store.add(unit, data_set, log.name, plain)
             export_table(to_table(store.history(unit), unit), table, force=force)
     if keep:
-        with _open(figures, config, write=True) as store:
+        with _open(figures, config, create=True) as store:
             count = store.add(unit, data_set, log.name, plain)
             print(f"{count} new of {len(plain)} cycles, in {store.name}")
             _say_if_deleted(store, unit, plain)
@@ -204,7 +204,7 @@ def trend(
     require_writable(json_file, picture)
     chosen_figures = _chosen_figures(names, picture)
     limits = _limits(config)
-    with _open(figures, config, write=False) as store:
+    with _open(figures, config, create=False) as store:
         columns = [f"{figure.name}_{side}" for figure in chosen_figures for side in SIDES]
         history = _history(store, chosen_unit(store, config, unit), days, columns)
     plain = []
@@ -231,7 +231,7 @@ def counters(
     ] = False,
 ) -> None:
     """Suction cycles, valve switchings and alarms: in all, and since they were erased."""
-    with _open(figures, config, write=erase) as store:
+    with _open(figures, config, create=False) as store:
         chosen = chosen_unit(store, config, unit)
         if erase:
             store.erase(chosen)
@@ -259,11 +259,8 @@ def forget(
     from twin.figures.retention import forget as forget_cycles
     from twin.instants import DAY_NS
 
-    with _open(
-        figures, config, write=False
-    ) as store:  # which makes no database where there is none
+    with _open(figures, config, create=False) as store, status() as say:
         chosen = chosen_unit(store, config, unit)
-    with _open(figures, config, write=True) as store, status() as say:
         before_ns = time.time_ns() - round(older_than * DAY_NS)
         deleted = forget_cycles(
             store, chosen, before_ns, lambda count: say(f"{count} cycles deleted")
@@ -287,7 +284,7 @@ def autoset(
     from twin.figures.autoset import autoset as teach
 
     share = _settings(config).autoset_tolerance if tolerance is None else tolerance
-    with _open(figures, config, write=False) as store:
+    with _open(figures, config, create=False) as store:
         chosen = chosen_unit(store, config, unit)
         permitted = teach(store.history(chosen), share)
     print(f"# from the last {permitted.cycles} good cycles of {chosen.id or chosen.type}")
@@ -308,7 +305,7 @@ def export(
     from twin.tables.sheet import export as export_table
 
     refuse_existing(output, force=force)
-    with _open(figures, config, write=False) as store:
+    with _open(figures, config, create=False) as store:
         chosen = chosen_unit(store, config, unit)
         table = to_table(_history(store, chosen, days), chosen)
     export_table(table, output, force=force)
@@ -343,7 +340,7 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
         return None
     parse_url(figure_settings.url, FIGURE_DATABASE)
     unit = Unit(settings.asset.type, settings.asset.id)
-    open_database = partial(open_chosen, "", settings.document, write=True)
+    open_database = partial(open_chosen, "", settings.document, create=True)
     days = figure_settings.keep_days
     retention = None if days is None else Retention(days, say)
     return lambda: Keeper(open_database, unit, settings.data.hash, say, retention)
@@ -358,10 +355,10 @@ def _document(config: Path | None) -> "Document | None":
     return read_config(config) if config else None
 
 
-def _open(url: str, config: Path | None, *, write: bool) -> "Store":
+def _open(url: str, config: Path | None, *, create: bool) -> "Store":
     from twin.figures.database_url import open_chosen
 
-    store = open_chosen(url, _document(config), write=write)
+    store = open_chosen(url, _document(config), create=create)
     print(f"figure database: {store.name}", file=sys.stderr)
     return store
 

@@ -196,7 +196,8 @@ class Evidence:
             phase = self._phases(sensing[lane])
             rows = self._drawn(courses[lane], phase)
             level = self._levels(rows, courses[lane], sensing[lane])
-            driven, phase, level = self._given_sooner(courses[lane], phase[rows], level)
+            sooner = [base[_DELAYS].min() < 0.0 for base in bases[lane]]
+            driven, phase, level = self._given_sooner(sooner, courses[lane], phase[rows], level)
             expected = self._run(driven, phase, level, rows, kernel.COARSE_TOLERANCE)
             off: Floats = (self._measured[:, None] - self.bins.through(rows, expected)) / MBAR
             return off
@@ -310,15 +311,14 @@ class Evidence:
         return level
 
     def _given_sooner(
-        self, courses: Sequence[Schedule], phase: Phases, level: Floats
+        self, sooner: Sequence[bool], courses: Sequence[Schedule], phase: Phases, level: Floats
     ) -> tuple[Sequence[Schedule], Phases, Floats]:
         """Drives of the kernel, if valves of some courses act before their commands are seen.
 
-        Commands of these courses are a row sooner, and their delays longer by that. A negative
-        delay is thus exact, if it is shorter than a row. ``phase`` and ``level`` are at some rows,
-        those beside each command among them.
+        Commands of the courses that are ``sooner`` come a row sooner, and their delays are longer
+        by that. A negative delay is thus exact, if it is shorter than a row. ``phase`` and
+        ``level`` are at some rows, those beside each command among them.
         """
-        sooner = [min(theta[_DELAYS].min() for _, theta in course) < 0.0 for course in courses]
         if not any(sooner):
             return courses, phase, level
         shape = (len(phase), len(courses))

@@ -136,7 +136,7 @@ def _learned(deviation: _HealthyDeviation, cycles: Sequence[int]) -> Healthy:
                     name: float(size * factor)
                     for (name, (_, size)), factor in zip(SCATTER.items(), sizes, strict=True)
                 },
-                "meets_ms": float(meets * evidence.healthy.meets_ms),
+                "meets_ms": float(meets * MEETS_MS),
             }
         )
     return healthy
@@ -153,7 +153,7 @@ def _amplitudes(
     known_sizes = [healthy.scatter.get(name, size) / size for name, (_, size) in SCATTER.items()]
     prior = np.ones(moves.shape[1])
     prior[: len(known_sizes)] = known_sizes
-    prior[MEETS] = healthy.meets_ms / deviation.evidence.healthy.meets_ms
+    prior[MEETS] = healthy.meets_ms / MEETS_MS
     for cycle in cycles:
         weights = model.of([cycle], scattered=False)
         white = weights.white(np.column_stack([deviation.off, moves]))

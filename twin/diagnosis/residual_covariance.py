@@ -26,7 +26,6 @@ from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import (
     SCATTERING,
-    as_left,
     comes_on_part,
     from_cycle_to_cycle,
     lasting,
@@ -100,22 +99,20 @@ class Covariance:
         unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
         unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
         mismatches = [self.mismatch[rows], self.day_mismatch[rows]]
-        of_cycles = _runs(bins.cycle[rows])
-        groups = [
-            self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle])
-            for of_cycle in of_cycles
-        ]
-        variance = np.concatenate([np.empty(0), *map(np.diag, groups)])
+
+        def by_cycle(leftover: float) -> list[Floats]:
+            return [
+                self._of_cycle(rows[of_cycle], alone[of_cycle], scatter[of_cycle], leftover)
+                for of_cycle in _runs(bins.cycle[rows])
+            ]
+
+        variance = np.concatenate([np.empty(0), *map(np.diag, by_cycle(1.0))])
         variance += np.sum([error**2 for error in (common, *mismatches)], axis=0)
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
         is_unseen = unsure**2 > UNSEEN**2 * variance[:, None]
         is_unseen[:, self.beyond.shape[1] :] |= self.of_weather
         unmeasured = _row_rms(np.sum(unsure**2 * is_unseen, axis=1), bins.count[rows], 0.0)
-        noise = evidence.noise**2 / bins.count[rows]
-        groups = [
-            as_left(group, learned, noise[of_cycle])
-            for group, of_cycle in zip(groups, of_cycles, strict=True)
-        ]
+        groups = by_cycle(learned)
         moves, prior = _in_common(bins, rows, [learned * common, *mismatches], unsure)
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
@@ -125,12 +122,13 @@ class Covariance:
         factored = parts.CoupledCovariance.of(groups, moves, prior)
         return Weights(tuple(cycles), rows, factored, usual, unmeasured, sigma, shown)
 
-    def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats) -> Floats:
+    def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats, leftover: float) -> Floats:
         """Covariance (mbar²) between bins of a cycle of what differs from cycle to cycle."""
         bins, noise = self.evidence.bins, self.evidence.noise
         knees = parts.low_rank(scatter[:, KNEES], bins.stretch[rows])
         moves = np.delete(scatter, KNEES, axis=1)
-        return from_cycle_to_cycle(bins, rows, lasting(bins, rows, alone) + knees, moves, noise)
+        persistent = lasting(bins, rows, alone) + knees
+        return from_cycle_to_cycle(bins, rows, persistent, moves, noise, leftover)
 
 
 def _runs(number: Ints) -> list[slice]:

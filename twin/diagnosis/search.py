@@ -678,10 +678,13 @@ def _by_own_weights(
 def _by_two_pictures(
     evidence: Evidence, fitted: Sequence[int], current: _Found, rivals: Sequence[Sequence[Fitted]]
 ) -> list[list[Fitted]]:
-    """The rivals; one that is better than what was found by its weights has to be so by its own."""
+    """The rivals; one that is likelier than what was found counts by the poorer of two scores.
+
+    These are by the weights of what was found, and by its own.
+    """
 
     def judged(rival: Fitted) -> Fitted:
-        if rival.score >= current.found.score:
+        if _likelier(evidence, current.found, [[rival]]) is None:
             return rival
         _, by_own_weights = _by_own_weights(evidence, fitted, current, rival)
         return max(rival, by_own_weights, key=lambda candidate: candidate.score)

@@ -12,15 +12,15 @@ from twin.settings import Document
 FILE = "figures.sqlite"
 
 
-def open_chosen(named: str, document: Document | None, *, write: bool) -> Store:
+def open_chosen(named: str, document: Document | None, *, create: bool) -> Store:
     """Open the database named on the command line, else in the configuration, else the default.
 
     The default is a file beside the configuration, or in the current folder without one. A missing
-    file is created only with ``write``; otherwise it is a SourceError.
+    file is created only with ``create``; otherwise it is a SourceError.
     """
     if named:
-        return open_store(named, create=write)
-    return open_store(place_of(document), create=write)
+        return open_store(named, create=create)
+    return open_store(place_of(document), create=create)
 
 
 def place_of(document: Document | None) -> URL:

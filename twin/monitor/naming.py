@@ -7,6 +7,7 @@ size found. Covariance, alternative and priors are the same in both, and in the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from twin.monitor.model_bank import UNCERTAIN_LAWS, ways
 from twin.monitor.rows import drawn_rows, elapsed, time_steps
 from twin.monitor.scatter_covariance import (
     SCATTER,
-    as_left,
     by_contact,
     from_cycle_to_cycle,
     lasting,
@@ -182,9 +182,8 @@ class _Cycle:
         )
         moves = np.hstack([self.moves * (scatter / typical), self.late * healthy.meets_ms])
         goes_on = lasting(self.bins, self.first, alone)
-        usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE)
+        usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE, healthy.leftover)
         own = np.hypot(common, MISMATCH * self.off)
-        usual = as_left(usual, healthy.leftover, NOISE**2 / self.bins.count[self.first])
         return usual + fading(own, self.time, self.kind)
 
 
@@ -233,13 +232,16 @@ class _Expected:
         expected = np.where(np.isfinite(expected), expected, expected[:, :1])  # it has no answer
         off = deviation(self.samples, self.ticks)[self.begin :] / MBAR
         phase = self.ticks["phase"][self.begin :]
-        bins, mean, through = averaged(
-            phase, off, self.drawn[here] - self.begin, expected, PER_UNIT
-        )
+        drawn = self.drawn[here] - self.begin
+        bins, mean, through = averaged(phase, off, drawn, expected, PER_UNIT)
         first = np.unique(bins.place, return_index=True)[1]
-        kept, period = self.drawn[here] - self.begin, sampling_ms(self.samples) * MS
-        late = by_contact(bins, first, kept, expected[:, 0], self.theta, period)
+        late = by_contact(bins, first, drawn, expected[:, 0], self.theta, self._period)
         return _Cycle(bins, first, mean[first], derivatives(through[first])[1], late)
+
+    @cached_property
+    def _period(self) -> float:
+        """Seconds from row to row."""
+        return sampling_ms(self.samples) * MS
 
     def _expected(self, theta: Theta) -> Floats:
         """Pressure (Pa) at the drawn rows, (rows, n); ``theta`` is (coefficients, n)."""

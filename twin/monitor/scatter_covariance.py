@@ -116,23 +116,20 @@ def lasting(bins: Bins, rows: Ints, alone: Floats) -> Floats:
 
 
 def from_cycle_to_cycle(
-    bins: Bins, rows: Ints, persistent: Floats, moves: Floats, noise: float
+    bins: Bins,
+    rows: Ints,
+    persistent: Floats,
+    moves: Floats,
+    noise: float,
+    leftover: float,
 ) -> Floats:
     """Covariance (mbar²) between the bins ``rows`` of all differences between cycles.
 
     Noise (mbar, of a row), ``persistent`` errors (see ``lasting``), and scatter: ``moves`` are the
-    changes (mbar) of each bin by one sigma of each scattering effect, (bins, scatters).
+    changes (mbar) of each bin by one sigma of each thing that scatters, (bins, scatters). They are
+    scaled to the ``leftover`` (sigmas) that healthy cycles have. Noise is measured: it may grow
+    with that, and does not shrink.
     """
-    covariance = low_rank(moves, bins.cycle[rows]) + persistent
-    add_independent(covariance, noise**2 / bins.count[rows])
+    covariance = (low_rank(moves, bins.cycle[rows]) + persistent) * leftover**2
+    add_independent(covariance, (noise * max(leftover, 1.0)) ** 2 / bins.count[rows])
     return covariance
-
-
-def as_left(covariance: Floats, leftover: float, noise: Floats) -> Floats:
-    """``covariance`` of a cycle scaled to the ``leftover`` (sigmas) that healthy cycles have.
-
-    Its part of ``noise`` (mbar², in each bin) is measured, so it does not shrink.
-    """
-    scaled = covariance * leftover**2
-    add_independent(scaled, max(1.0 - leftover**2, 0.0) * noise)
-    return scaled

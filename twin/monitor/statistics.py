@@ -30,7 +30,6 @@ from twin.monitor.model_bank import (
 )
 from twin.monitor.scatter_covariance import (
     SCATTER,
-    as_left,
     by_contact,
     from_cycle_to_cycle,
     lasting,
@@ -161,9 +160,9 @@ class ScoreExtractor:
         moves = np.hstack(
             [self._moves(suspects[: len(cells.first)]), contact * self.healthy.meets_ms]
         )
-        covariance = from_cycle_to_cycle(bins, cells.first, cells.goes_on, moves, self.noise)
-        noise = self.noise**2 / bins.count[cells.first]
-        covariance = as_left(covariance, self.healthy.leftover, noise)
+        covariance = from_cycle_to_cycle(
+            bins, cells.first, cells.goes_on, moves, self.noise, self.healthy.leftover
+        )
         return CycleResidual(
             cells.place,
             cells.kind,

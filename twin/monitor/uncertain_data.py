@@ -69,8 +69,9 @@ def scattered(theta: Theta, healthy: Healthy, rng: np.random.Generator) -> Theta
         changed = theta + float(rng.standard_normal()) * moved
         theta = np.where(theta >= 0.0, np.maximum(changed, 0.0), changed)
     if comes_on_part(theta):
-        theta[c.CONTACT] += rng.standard_normal() * healthy.meets_ms * MS
-        theta[c.CONTACT] = max(theta[c.CONTACT], ON_THE_PART_S)
+        theta = theta.copy()
+        later = float(rng.standard_normal()) * healthy.meets_ms * MS
+        theta[c.CONTACT] = max(theta[c.CONTACT] + later, ON_THE_PART_S)
     return theta
 
 

@@ -271,7 +271,7 @@ class Ejector:
         figure = FIGURES[name]
         columns = [f"{name}_{side}" for side in SIDES]
         since = self._clock() - round(days * DAY_NS)
-        with open_figures("", self.config.document, write=False) as store:
+        with open_figures("", self.config.document, create=False) as store:
             history = store.history(self._unit, since, columns)
             deleted = store.deleted_until(self._unit)
         document: dict[str, Any] = {
@@ -308,7 +308,7 @@ class Ejector:
 
     def _alarms(self) -> AlarmStore:
         """The alarm database, opened anew each time, since it may have been removed."""
-        return open_alarms("", self.config.document, write=False)
+        return open_alarms("", self.config.document, create=False)
 
     def _board(self, store: AlarmStore, now: int) -> Board:
         board = Board(self._rules)
