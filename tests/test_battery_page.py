@@ -73,11 +73,14 @@ def test_a_page_without_a_place_for_the_run_is_refused() -> None:
 
 
 def test_tables_say_what_was_reached_and_what_was_not_found() -> None:
-    cases = [single("porous_leakage")]
+    cases = [single("porous_leakage", moved_mbar=3.14, noise_mbar=0.4)]
     text = tables(cases)
     assert "| explained and wrong | 1 of 1 (100%) | 3% to 100% | at most 1% | **no** |" in text
     assert "| `leakage` | 1 | 0 | 0 | porous_leakage 1 | 1 | 1.31 |" in text
-    row = "| single | 7 | gripper | leakage constant 1 | explained | porous_leakage constant 0.9 |"
+    row = (
+        "| single | 7 | gripper | leakage constant 1 | 3.1 mbar | 0.4 mbar | explained |"
+        " porous_leakage constant 0.9 |"
+    )
     assert row in text
     line = summary("first", cases, "2026-01-02", "abc")
     assert line == "2026-01-02, first world, commit abc, seeds 7 to 7: found 0 of 1 single."
@@ -131,7 +134,7 @@ def test_a_case_that_ends_in_an_error_is_not_found(kind: str) -> None:
     if kind == "commissioning":
         assert "| no suction phase | 1 |" in text
     else:
-        assert f"| {kind} | 3 | gripper | leakage constant 1 | error | – | – |" in text
+        assert f"| {kind} | 3 | gripper | leakage constant 1 | – | – | error | – | – |" in text
 
 
 def test_a_refusal_of_the_diagnosis_is_an_error_of_the_case(

@@ -17,7 +17,8 @@ from twin.diagnosis.healthy import learned, usual_leftover
 from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
 from twin.monitor.bins import Floats, binned
-from twin.monitor.scatter_covariance import by_contact, from_cycle_to_cycle, lasting
+from twin.monitor.breakpoints import converter_step, rounding_error
+from twin.monitor.scatter_covariance import Reading, by_contact, from_cycle_to_cycle, lasting
 from twin.monitor.uncertain_data import scattered
 from twin.signals import MBAR, MS, Phase
 
@@ -41,7 +42,7 @@ def test_what_is_left_shrinks_by_what_healthy_cycles_show_but_noise_does_not() -
     persistent = lasting(bins, rows, np.full(len(rows), 0.4))
 
     def scaled(leftover: float) -> Floats:
-        return from_cycle_to_cycle(bins, rows, persistent, moves, 0.3, leftover)
+        return from_cycle_to_cycle(bins, rows, persistent, moves, Reading(0.3), leftover)
 
     assert scaled(0.5) == pytest.approx(0.25 * (scaled(1.0) - noise) + noise)
     assert scaled(2.0) == pytest.approx(4.0 * scaled(1.0))
@@ -100,10 +101,13 @@ def test_what_follows_contact_comes_later_as_a_whole() -> None:
 
 
 def test_a_rig_of_another_world_that_meets_the_part_late_is_healthy() -> None:
-    """Cups come upon the part 60 ms after suction began; one sigma of that is 2 ms."""
+    """Cups come upon the part 60 ms after suction began; one sigma of that is 2 ms.
+
+    Readings are whole mbar with little noise, so that rounding shows as well.
+    """
     rig = draw_rig(198100, "gripper")
     vessel = replace(rig.vessel, contact_delay=0.06, contact_jitter=2e-3)
-    sensor = replace(rig.sensor, cadence_ms=1, step=5.0)  # coarse steps are another matter
+    sensor = replace(rig.sensor, cadence_ms=1, step=1.0 * MBAR, noise=0.07 * MBAR)
     rig = replace(rig, vessel=vessel, sensor=sensor)
     first, second = record(rig, 1, 12), record(rig, 2, 12)
     config = config_of(first.truth.readable)
@@ -123,6 +127,23 @@ def test_a_rig_of_another_world_that_meets_the_part_late_is_healthy() -> None:
 
     assert verdict(healthy.meets_ms) == "consistent"
     assert verdict(1e-6) == "unlisted"
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.1, 0.3, 0.6])
+def test_rounding_leaves_an_error_that_no_number_of_readings_takes_away(noise: float) -> None:
+    rng = np.random.default_rng(7)
+    truth = rng.uniform(-0.5, 0.5, 400)
+    read = np.round(truth[:, None] + rng.normal(0.0, noise, (400, 5000)))
+    errors = np.sqrt(np.mean((read.mean(axis=1) - truth) ** 2))
+    of_all = np.sqrt(np.mean((read - truth[:, None]) ** 2))
+    chance = noise / np.sqrt(5000)
+    assert rounding_error(1.0, of_all) == pytest.approx(errors, rel=0.35, abs=2.0 * chance)
+    assert converter_step(np.repeat(np.arange(30.0), 3)) == 1.0
+
+
+def test_readings_without_steps_have_no_rounding_error() -> None:
+    assert rounding_error(0.0, 0.3) == 0.0
+    assert converter_step(np.array([7.0, 7.0])) == 0.0
 
 
 def test_a_drawn_cycle_meets_the_part_at_another_time_and_what_it_is_drawn_from_stays() -> None:

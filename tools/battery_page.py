@@ -100,7 +100,17 @@ def tables(cases: Sequence[Case]) -> str:
             _effects(list(of_kind(cases, "single"))),
         ),
         table(
-            ("not found", "seed", "system", "hidden", "verdict", "named", "sigmas left"),
+            (
+                "not found",
+                "seed",
+                "system",
+                "hidden",
+                "moves the record",
+                "noise",
+                "verdict",
+                "named",
+                "sigmas left",
+            ),
             _missed([case for case in cases if not case.found and case.kind != "commissioning"]),
         ),
         *reliability(cases),
@@ -294,10 +304,16 @@ def _missed(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
             str(case.seed),
             case.system,
             hidden,
+            *(_mbar(case.more.get(key)) for key in ("moved_mbar", "noise_mbar")),
             case.verdict,
             case.named or "–",
             leftover,
         )
+
+
+def _mbar(value: float | None) -> str:
+    """An rms over all rows; a world may not have it."""
+    return "–" if value is None else f"{value:.2g} mbar"
 
 
 def _seconds(cases: Sequence[Case]) -> Iterator[Sequence[str]]:

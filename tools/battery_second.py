@@ -475,7 +475,8 @@ def diagnosed(met: Met, kind: str, number: int, hidden: Sequence[Hidden]) -> Cas
     def answer() -> Mapping[str, Any]:
         return diagnose(unit, [samples], "battery", _quiet).json
 
-    more: dict[str, Any] = {"moved_mbar": round(moved, 3)}
+    noise = unit.data.sensor.noise_mbar
+    more: dict[str, Any] = {"moved_mbar": round(moved, 3), "noise_mbar": round(noise, 3)}
     if kind == "single":
         effect = hidden[0].effect
         more["of_volume"] = effect in OF_VOLUME

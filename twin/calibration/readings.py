@@ -14,6 +14,7 @@ import numpy.typing as npt
 from twin.calibration.flow_meter import Suction, stored
 from twin.figures.curve import flow_behind
 from twin.model.gas import R
+from twin.monitor.breakpoints import SHARE_OF_STEP, converter_step
 from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at
 from twin.monitor.surroundings import told
@@ -126,8 +127,8 @@ def read(samples: Samples) -> Readings:
     period = float(np.median(intervals))
     numbers = samples["sequence"]
     span = max(int(numbers[-1] - numbers[0]) + 1, 1)
-    noise, step = noise_of(pressure, period), _step(pressure)
-    noise = max(noise, step / np.sqrt(12.0))
+    noise, step = noise_of(pressure, period), converter_step(pressure)
+    noise = max(noise, SHARE_OF_STEP * step)
     command_stretches = list(stretches(rows["commands"]))
     width = max(round(SMOOTH_MS * MS / period), 3)
     edge = max(round(EDGE_MS * MS / period), 1)
@@ -262,12 +263,6 @@ def _smoothed(pressure: Floats, width: int) -> Floats:
     """Moving mean over ``width`` rows; fewer at the ends."""
     sums = np.convolve(pressure, np.ones(width), "same")
     return sums / np.convolve(np.ones(len(pressure)), np.ones(width), "same")
-
-
-def _step(pressure: Floats) -> float:
-    """The smallest frequent difference (Pa) between readings: a step of the converter."""
-    levels = np.unique(np.round(pressure, 1))
-    return float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
 
 
 def _idle(

@@ -26,6 +26,7 @@ from twin.monitor.bins import Bins, Floats, Ints
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR
 from twin.monitor.scatter_covariance import (
     SCATTERING,
+    Reading,
     comes_on_part,
     from_cycle_to_cycle,
     lasting,
@@ -107,13 +108,14 @@ class Covariance:
             ]
 
         variance = np.concatenate([np.empty(0), *map(np.diag, by_cycle(1.0))])
-        variance += np.sum([error**2 for error in (common, *mismatches)], axis=0)
+        rounding = np.full(len(rows), evidence.healthy.rounding_mbar)
+        variance += np.sum([error**2 for error in (common, rounding, *mismatches)], axis=0)
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
         is_unseen = unsure**2 > UNSEEN**2 * variance[:, None]
         is_unseen[:, self.beyond.shape[1] :] |= self.of_weather
         unmeasured = _row_rms(np.sum(unsure**2 * is_unseen, axis=1), bins.count[rows], 0.0)
         groups = by_cycle(learned)
-        moves, prior = _in_common(bins, rows, [learned * common, *mismatches], unsure)
+        moves, prior = _in_common(bins, rows, [learned * common, rounding, *mismatches], unsure)
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
             groups.append(np.diag(sigma**2) + _common_levels(evidence, cycles))
@@ -124,11 +126,12 @@ class Covariance:
 
     def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats, leftover: float) -> Floats:
         """Covariance (mbar²) between bins of a cycle of what differs from cycle to cycle."""
-        bins, noise = self.evidence.bins, self.evidence.noise
+        bins, healthy = self.evidence.bins, self.evidence.healthy
+        reading = Reading(self.evidence.noise, healthy.rounding_mbar)
         knees = parts.low_rank(scatter[:, KNEES], bins.stretch[rows])
         moves = np.delete(scatter, KNEES, axis=1)
         persistent = lasting(bins, rows, alone) + knees
-        return from_cycle_to_cycle(bins, rows, persistent, moves, noise, leftover)
+        return from_cycle_to_cycle(bins, rows, persistent, moves, reading, leftover)
 
 
 def _runs(number: Ints) -> list[slice]:

@@ -4,6 +4,7 @@ No model of the system is used. Windows follow from the noise, the sampling and 
 course; all lengths are times, whatever the sampling.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -40,6 +41,22 @@ STEP_POINTS = 80
 CLEAR, FIRST = 8.0, 0.6  # least sigmas of a break; an earlier one with this share of them wins
 RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # s; sigmas; times as far away; share
 STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # least sigmas of a break with a step; least χ² it must gain
+
+
+def converter_step(pressure: Floats) -> float:
+    """The smallest frequent difference (Pa) between readings: a step of the converter, or 0."""
+    levels = np.unique(np.round(pressure, 1))
+    return float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
+
+
+def rounding_error(step: float, noise: float) -> float:
+    """Rms error that rounding to steps leaves in a mean over many readings of one pressure.
+
+    ``noise`` is one sigma of readings, that of rounding included; all in one unit. Noise beneath
+    the steps lets means come closer: the first harmonic of the rounding error remains (Widrow).
+    """
+    beneath = max(noise**2 - (SHARE_OF_STEP * step) ** 2, 0.0)
+    return SHARE_OF_STEP * step * math.exp(-2.0 * math.pi**2 * beneath / step**2) if step else 0.0
 
 
 def smoothed(pressure: Floats, width: int) -> Floats:
@@ -98,8 +115,7 @@ class Noise:
             quiet = _least_noise(parts, rows, width)
             if quiet < span:
                 break
-        levels = np.unique(np.round(pressure, 1))
-        step = float(np.quantile(np.diff(levels), 0.1)) if len(levels) > 2 else 0.0
+        step = converter_step(pressure)
         rows_per_reading = 1.0 / max(float(np.mean(falls != 0.0)), 0.05) if len(falls) > 9 else 1.0
         hum = single > HUMS * short
         of_a_row = max(short, step * SHARE_OF_STEP)

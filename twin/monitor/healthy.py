@@ -59,6 +59,7 @@ class Healthy(Settings):
     ``uncertain`` (the lower Cholesky factor of its covariance, a row for each value).
     ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows, and
     ``meets_ms`` of the time at which cups come upon the part, if that is after suction began.
+    ``rounding_mbar`` is one sigma of what rounding leaves in a mean of many readings.
     ``key_figures`` are those that have limits, in their own units.
     """
 
@@ -69,6 +70,7 @@ class Healthy(Settings):
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
     unseen_level_mbar: float = Field(UNSEEN_LEVEL_MBAR, gt=0.0)
     meets_ms: float = Field(MEETS_MS, gt=0.0)
+    rounding_mbar: float = Field(0.0, ge=0.0)
     key_figures: Mapping[str, Scatter] = Field(default_factory=dict)
 
     @property

@@ -27,6 +27,7 @@ from twin.monitor.model_bank import UNCERTAIN_LAWS, ways
 from twin.monitor.rows import drawn_rows, elapsed, time_steps
 from twin.monitor.scatter_covariance import (
     SCATTER,
+    Reading,
     by_contact,
     from_cycle_to_cycle,
     lasting,
@@ -182,7 +183,9 @@ class _Cycle:
         )
         moves = np.hstack([self.moves * (scatter / typical), self.late * healthy.meets_ms])
         goes_on = lasting(self.bins, self.first, alone)
-        usual = from_cycle_to_cycle(self.bins, self.first, goes_on, moves, NOISE, healthy.leftover)
+        usual = from_cycle_to_cycle(
+            self.bins, self.first, goes_on, moves, Reading(NOISE), healthy.leftover
+        )
         own = np.hypot(common, MISMATCH * self.off)
         return usual + fading(own, self.time, self.kind)
 

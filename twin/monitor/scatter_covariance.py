@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -115,21 +116,30 @@ def lasting(bins: Bins, rows: Ints, alone: Floats) -> Floats:
     return fading(alone, time, stretch) + low_rank(knee[:, None], stretch)
 
 
+class Reading(NamedTuple):
+    """What readings are off by (mbar, one sigma)."""
+
+    noise: float  # of a row
+    rounding: float = 0.0  # of all readings of a stretch at one pressure
+
+
 def from_cycle_to_cycle(
     bins: Bins,
     rows: Ints,
     persistent: Floats,
     moves: Floats,
-    noise: float,
+    reading: Reading,
     leftover: float,
 ) -> Floats:
     """Covariance (mbar²) between the bins ``rows`` of all differences between cycles.
 
-    Noise (mbar, of a row), ``persistent`` errors (see ``lasting``), and scatter: ``moves`` are the
+    Errors of ``reading``, ``persistent`` errors (see ``lasting``), and scatter: ``moves`` are the
     changes (mbar) of each bin by one sigma of each thing that scatters, (bins, scatters). They are
     scaled to the ``leftover`` (sigmas) that healthy cycles have. Noise is measured: it may grow
-    with that, and does not shrink.
+    with that, and does not shrink. Rounding is known; healthy cycles may hardly show it.
     """
     covariance = (low_rank(moves, bins.cycle[rows]) + persistent) * leftover**2
-    add_independent(covariance, (noise * max(leftover, 1.0)) ** 2 / bins.count[rows])
+    if reading.rounding > 0.0:
+        covariance += low_rank(np.full((len(rows), 1), reading.rounding), bins.stretch[rows])
+    add_independent(covariance, (reading.noise * max(leftover, 1.0)) ** 2 / bins.count[rows])
     return covariance

@@ -30,6 +30,7 @@ from twin.monitor.model_bank import (
 )
 from twin.monitor.scatter_covariance import (
     SCATTER,
+    Reading,
     by_contact,
     from_cycle_to_cycle,
     lasting,
@@ -161,7 +162,12 @@ class ScoreExtractor:
             [self._moves(suspects[: len(cells.first)]), contact * self.healthy.meets_ms]
         )
         covariance = from_cycle_to_cycle(
-            bins, cells.first, cells.goes_on, moves, self.noise, self.healthy.leftover
+            bins,
+            cells.first,
+            cells.goes_on,
+            moves,
+            Reading(self.noise, self.healthy.rounding_mbar),
+            self.healthy.leftover,
         )
         return CycleResidual(
             cells.place,
@@ -232,7 +238,7 @@ class _Places:
             np.concatenate([place, numbers]),
             np.concatenate([kind, numbers]),
             np.concatenate([time, np.zeros(len(shown))]),
-            np.concatenate([common, sigmas]),
+            np.concatenate([np.hypot(common, healthy.rounding_mbar), sigmas]),
             lasting(bins, first, alone),
         )
 
