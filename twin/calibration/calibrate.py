@@ -151,7 +151,7 @@ def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> 
     theta = coefficients(data)
     cycle_figures = [figures(cycle, theta) for cycle in cycles]
     refuse_changing(
-        Cycles.as_live(samples, data), theta, data.sensor.noise_mbar * MBAR, cycle_figures
+        Cycles.as_live(samples, data), theta, data.sensor.noise_in_means() * MBAR, cycle_figures
     )
 
 

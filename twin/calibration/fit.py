@@ -227,7 +227,8 @@ class Fitted:
 
 def fit(samples: Samples, space: Space, progress: Callable[[str], None]) -> Fitted:
     """Fit the free parameters to healthy cycles of a unit of known type, starting from its data."""
-    x, best, noise = np.zeros(len(space.free)), space.data, space.data.sensor.noise_mbar * MBAR
+    x, best = np.zeros(len(space.free)), space.data
+    noise = best.sensor.noise_in_means() * MBAR
     for round_number, tolerance in enumerate(ROUNDS):
         progress(f"fitting, round {round_number + 1} of {len(ROUNDS)}")
         rows = round(len(samples) * (FIRST_SHARE if round_number == 0 else 1.0))
@@ -268,7 +269,7 @@ def fit_from_afar(
     A second pressure is followed afterwards, if most rows have one: from a guess, two pressures
     mislead a fit more often than one. It is left out if the first is then followed less well.
     """
-    noises = [guesses[0].sensor.noise_mbar * MBAR]
+    noises = [guesses[0].sensor.noise_in_means() * MBAR]
     spaces = [Space.of_market(guess, free) for guess in guesses]
     starts = [_Start(space, np.zeros(len(space.free))) for space in spaces]
     for number, fit_round in enumerate(NARROWING, 1):

@@ -505,7 +505,8 @@ def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
     """
     blocks = read_again(blocks)
     theta = coefficients(config.data)
-    knees = knees_of(config.data, sampling_ms(max(blocks, key=len, default=np.empty(0, SAMPLE))))
+    sampling = sampling_ms(max(blocks, key=len, default=np.empty(0, SAMPLE)))
+    knees = knees_of(config.data, sampling)
     nothing = Evidence(
         theta=theta,
         begin_ns=0,
@@ -518,7 +519,7 @@ def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
         figures=[],
         healthy=config.monitor.healthy,
         volumes_within=config.data.system.volumes_within_factor,
-        noise=config.data.sensor.noise_mbar,
+        noise=config.data.sensor.noise_in_means(sampling),
         bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), [], knees),
         rows=np.empty(0, np.int64),
         terms=config.data.terms,

@@ -190,7 +190,16 @@ class Wiring(Settings):
     lag_ms: float = Field(3.0, ge=0.5, le=500.0)  # of sensor and input, in two equal stages
     noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
     sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # from row to row
+    renewed_ms: float = Field(0.0, ge=0.0, le=100.0)  # from reading to reading; 0: as rows come
     reference: Literal["absolute", "gauge"] = "absolute"  # what it counts from: zero, or ambient
+
+    def noise_in_means(self, sampling_ms: float | None = None) -> float:
+        """One sigma (mbar) of a row's noise as it counts in means over rows.
+
+        Rows that repeat a reading say nothing new: in means each has √n times the noise.
+        """
+        repeated = self.renewed_ms / (sampling_ms or self.sampling_ms)
+        return self.noise_mbar * math.sqrt(max(repeated, 1.0))
 
 
 class System(Settings):

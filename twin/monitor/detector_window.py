@@ -33,7 +33,8 @@ MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 def knees_of(data: DataSet, sampling_ms: float | None = None) -> Knees:
     """Properties of breakpoints for a data set's unit, at its sampling or at that of a record."""
     period = (sampling_ms or data.sensor.sampling_ms) * MS
-    return expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR, period)
+    noise = data.sensor.noise_in_means(sampling_ms) * MBAR
+    return expected_knees(coefficients(data), noise, period)
 
 
 def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:

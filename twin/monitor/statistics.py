@@ -117,7 +117,7 @@ class ScoreExtractor:
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy) -> "ScoreExtractor":
         """The extractor for cycles with the twin of a data set."""
-        theta, noise = coefficients(data), data.sensor.noise_mbar
+        theta, noise = coefficients(data), data.sensor.noise_in_means()
         return cls(theta, healthy, noise, knees_of(data), suspects_of(data, theta))
 
     def __post_init__(self) -> None:
