@@ -45,7 +45,7 @@ from twin.calibration.parameters import (
     values,
     with_values,
 )
-from twin.calibration.readings import Readings, deep, read, turns
+from twin.calibration.readings import Readings, deep, read
 from twin.calibration.report import commissioned_as_json, commissioned_in_words, headline
 from twin.calibration.save import store_first
 from twin.calibration.verdict import Residual, Verdict, _rms_and_floor, judge
@@ -56,6 +56,7 @@ from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients, sensor_place
 from twin.model.parts import Cups
+from twin.monitor.breakpoints import turns
 from twin.quality import BREAK, Quality
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, bridged
 
@@ -520,9 +521,9 @@ def test_a_cycle_in_which_something_went_wrong_counts_little_in_what_is_left_and
 def test_a_turn_needs_what_noise_does_not_make() -> None:
     fall, rise = np.linspace(10.0, 2.0, 50), np.linspace(2.0, 4.0, 50)
     smooth = np.concatenate([fall, rise, rise[::-1]])
-    assert turns(smooth, 1.0) == ([49], [99])
-    assert turns(smooth, 3.0) == ([], [])
-    assert turns(fall, 1.0) == ([], [])
+    assert turns(smooth, 1.0) == [49, 99]
+    assert turns(smooth, 3.0) == []
+    assert turns(fall, 1.0) == []
 
 
 @pytest.mark.parametrize(("falls", "again"), [(18.0, [60]), (2.0, [])])
@@ -533,7 +534,8 @@ def test_the_nozzle_is_on_again_where_the_pressure_falls_to_where_it_went_off(
     down, up = np.linspace(1000.0, 400.0, 41), np.linspace(400.0, 420.0, 21)[1:]
     after = np.linspace(420.0, 420.0 - falls, 11)[1:]
     smooth = np.concatenate([down, up, after, np.linspace(after[-1], 440.0, 20)])
-    assert deep(smooth, *turns(smooth, 1.0)) == ([40, 70] if again else [40], again)
+    rows = turns(smooth, 1.0)
+    assert deep(smooth, rows[0::2], rows[1::2]) == ([40, 70] if again else [40], again)
 
 
 def test_the_record_corrects_the_configuration_and_says_the_line() -> None:

@@ -16,7 +16,7 @@ from twin.calibration.cycles import Cycles
 from twin.monitor.breakpoints import Noise, beside_parabolas
 from twin.monitor.offline_switching import Switching, noise_of, switchings
 from twin.quality import Quality
-from twin.signals import MBAR, SAMPLE, Command, Phase, Samples
+from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
 Floats = npt.NDArray[np.float64]
 IDLE_MS, SUCTION_MS, CYCLES = 300, 1500, 4
@@ -77,6 +77,17 @@ def test_each_switching_of_a_foreign_rig_is_found_and_no_other(seed: int, kind: 
         found = score(seed, kind, leaks=leaks)
         assert not found.missed
         assert not found.false
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind"), [(198144, "gripper"), (198322, "long_hose"), (198347, "held_part")]
+)
+def test_a_line_that_rings_breaks_in_each_cycle_at_the_same_time(seed: int, kind: str) -> None:
+    """The slope breaks again and again as it rings; in all cycles the same break is meant."""
+    rig = draw_rig(seed)
+    assert rig.kind == kind
+    found = scored("ringing", record(rig, seed, 12))
+    assert np.std([late for late, _ in found.late]) < 2.0 * MS
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from twin.calibration.flow_meter import Suction, stored
 from twin.figures.curve import flow_behind
 from twin.model.gas import R
-from twin.monitor.breakpoints import SHARE_OF_STEP, converter_step
+from twin.monitor.breakpoints import SHARE_OF_STEP, converter_step, turns
 from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at
 from twin.monitor.surroundings import told
@@ -143,7 +143,8 @@ def read(samples: Samples) -> Readings:
     nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
     for stretch in suctions:
         smooth = _smoothed(pressure[stretch.first : stretch.last], width)[edge:]
-        lows, highs = deep(smooth, *turns(smooth, turn))
+        rows_of_turns = turns(smooth, turn)
+        lows, highs = deep(smooth, rows_of_turns[0::2], rows_of_turns[1::2])
         offs += list(smooth[lows])
         ons += list(smooth[highs])
         edges = [stretch.first + row for row in told_edges(nozzle[stretch.first : stretch.last])]
@@ -239,22 +240,6 @@ def _renewed(pressure: Floats, suctions: list[Stretch], period: float, step: flo
     if len(repeated) < FEWEST_FALLS or not LEAST_REPEATED < repeated.mean() < 1.0:
         return 0.0
     return period / (1.0 - float(repeated.mean()))
-
-
-def turns(smooth: Floats, least: float) -> tuple[list[int], list[int]]:
-    """Rows of the lows and the highs between which ``smooth`` moves by at least ``least``.
-
-    ``smooth`` begins by falling. A last low or high that nothing follows does not count.
-    """
-    rows: tuple[list[int], list[int]] = ([], [])
-    is_falling, best = True, 0
-    for row, value in enumerate(smooth.tolist()):
-        if (value < smooth[best]) if is_falling else (value > smooth[best]):
-            best = row
-        elif abs(value - smooth[best]) >= least:
-            rows[0 if is_falling else 1].append(best)
-            is_falling, best = not is_falling, row
-    return rows
 
 
 def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, vertex
+from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, turns, vertex
 from twin.signals import MS
 
 FEWEST = 3  # breakpoints, for a mean course
@@ -23,6 +23,7 @@ CLEAR = 5.0  # sigmas of a reading
 # Share of the squares. On 35 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
 # pressure places breaks better, and 0.46 or more where the breaks place themselves.
 MUCH_MORE_ALIKE = 0.25
+ELSEWHERE = 3.0  # rms over noise, from which the course about a knee is another than the usual one
 ROUNDS, NARROWS = 4, 0.7
 OF_NOISE = 40.0  # variance factor of the time, as in ``breakpoints``, with the common shape known
 LEAST, LEAST_ROWS = 80.0 * MS, 12  # shortest window on either side
@@ -74,6 +75,62 @@ def align_by_level(course: Course, knees: Sequence[Knee]) -> None:
     if after < MUCH_MORE_ALIKE * before:
         for knee, time in zip(knees, by_level.tolist(), strict=True):
             knee.time = time
+
+
+def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
+    """Move each knee to where the course about it is most like the usual one, if that is much more.
+
+    A line that rings after the nozzle has closed breaks the slope again and again: some knees may
+    be at another of these breaks than most. Levels and slopes of the courses do not count. If most
+    are at a later break, all move to the first one: to where the fall ends for the first time.
+    Knees that come sooner after one another than such a course lasts stay where they are.
+    """
+    times = np.array([knee.time for knee in knees])
+    rows = np.array([knee.rows for knee in knees], np.int64).reshape(-1, 2)
+    limits = course.time[rows - [0, 1]]
+    has_room = (times - AROUND > limits[:, 0]) & (times + AROUND < limits[:, 1])
+    if np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(knees)):
+        return
+    about = _Bent(course)
+    usual = np.median(about.at(times[has_room]), axis=0)
+    shifts = np.arange(-FARTHEST, FARTHEST + 0.5 * course.period, course.period)
+    for number, (first, last) in enumerate(limits):
+        at = times[number] + shifts
+        at = np.append(times[number], at[(at - AROUND > first) & (at + AROUND < last)])
+        squares = np.mean((about.at(at) - usual) ** 2, axis=1)
+        best = int(squares.argmin())
+        is_off = squares[0] > (ELSEWHERE * course.noise.single) ** 2
+        if is_off and squares[best] < MUCH_MORE_ALIKE * squares[0]:
+            times[number] = at[best]
+    times += _first_end_of_fall(course, times[has_room])
+    for knee, time in zip(knees, times.tolist(), strict=True):
+        knee.time = time
+
+
+@dataclass(frozen=True)
+class _Bent:
+    """Courses about times, each without its own line."""
+
+    course: Course
+
+    def at(self, times: Floats) -> Floats:
+        """What remains of them (Pa), (times, rows)."""
+        offsets = np.arange(-AROUND, AROUND, self.course.period)
+        straight = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(offsets)), 2))[0]
+        values = np.interp(times[:, None] + offsets, self.course.time, self.course.pressure)
+        without_line: Floats = values - (values @ straight) @ straight.T
+        return without_line
+
+
+def _first_end_of_fall(course: Course, times: Floats) -> float:
+    """Time (s, not positive) from breaks to where the usual fall before them has ended already.
+
+    0 if it only falls up to the break.
+    """
+    offsets = np.arange(-AROUND, 0.5 * course.period, course.period)
+    falls = np.interp(times[:, None] + offsets, course.time, course.pressure)
+    rows = turns(np.median(falls, axis=0), CLEAR * course.noise.single)
+    return float(offsets[rows[0]]) if len(rows) > 1 else 0.0  # a low, and a high after it
 
 
 def _passed_by_all(course: Course, knees: Sequence[Knee]) -> float:

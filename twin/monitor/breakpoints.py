@@ -43,6 +43,21 @@ RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # s; sigmas; times as 
 STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # least sigmas of a break with a step; least χ² it must gain
 
 
+def turns(smooth: Floats, least: float) -> list[int]:
+    """Rows of lows and highs in turn, a low first, between which it moves by ``least`` or more.
+
+    ``smooth`` begins by falling. A last turn that nothing follows does not count.
+    """
+    rows, falling, best, best_value = list[int](), True, 0, float(smooth[0])
+    for row, value in enumerate(smooth.tolist()):
+        if (value < best_value) if falling else (value > best_value):
+            best, best_value = row, value
+        elif abs(value - best_value) >= least:
+            rows.append(best)
+            falling, best, best_value = not falling, row, value
+    return rows
+
+
 def converter_step(pressure: Floats) -> float:
     """The smallest frequent difference (Pa) between readings: a step of the converter, or 0."""
     levels = np.unique(np.round(pressure, 1))

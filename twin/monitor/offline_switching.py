@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.inference.levels import MAD_TO_SIGMA
-from twin.monitor.alignment import Knee, align, align_by_level
+from twin.monitor.alignment import Knee, align, align_by_course, align_by_level
 from twin.monitor.breakpoints import (
     Course,
     Floats,
@@ -29,6 +29,7 @@ from twin.monitor.breakpoints import (
     rung,
     smoothed,
     stepped,
+    turns,
 )
 from twin.quality import UNUSABLE
 from twin.signals import MBAR, MS, NS, Phase, Reported, Samples
@@ -195,6 +196,8 @@ def _all_knees(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
     for on in (False, True):
         align(course, [knee for knee in knees if knee.on == on])
     align_by_level(course, [knee for knee in knees if not knee.on])
+    for later in (False, True):
+        align_by_course(course, [knee for knee in knees if not knee.on and knee.later == later])
     return sorted(knees, key=lambda knee: knee.time)
 
 
@@ -400,21 +403,6 @@ class _SlopeBreak(NamedTuple):
     share: float  # of the fall's slope
     level: float  # Pa
     window: int  # rows
-
-
-def turns(smooth: Floats, least: float) -> list[int]:
-    """Rows of lows and highs in turn, a low first, between which it moves by ``least`` or more.
-
-    ``smooth`` begins by falling. A last turn that nothing follows does not count.
-    """
-    rows, falling, best, best_value = list[int](), True, 0, float(smooth[0])
-    for row, value in enumerate(smooth.tolist()):
-        if (value < best_value) if falling else (value > best_value):
-            best, best_value = row, value
-        elif abs(value - best_value) >= least:
-            rows.append(best)
-            falling, best, best_value = not falling, row, value
-    return rows
 
 
 def _first_below(falling: Floats, level: float, default: int) -> int:
