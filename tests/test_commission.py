@@ -218,22 +218,6 @@ def test_the_record_shows_its_noise_thresholds_and_whether_it_is_opened(name: st
     assert found.opened == (name == "gripper")
 
 
-@pytest.mark.parametrize("name", ["test_rig", "gripper"])
-@pytest.mark.parametrize("renewed", [1, 2, 5])
-def test_rows_that_repeat_a_reading_are_recognised(name: str, renewed: int) -> None:
-    samples = log_of(name).copy()
-    rows = np.arange(len(samples)) // renewed * renewed
-    samples["pressure"] = samples["pressure"][rows]
-    found = read(samples)
-    expected = float(renewed) if renewed > 1 else 0.0
-    assert found.renewed / MS == pytest.approx(expected, rel=0.1)
-    data, _ = guessed(typed(name).data, found)
-    assert data.sensor.renewed_ms == found.renewed / MS
-    in_means = data.sensor.noise_mbar * np.sqrt(renewed)
-    assert data.sensor.noise_in_means() == pytest.approx(in_means, rel=0.1)
-    assert data.sensor.noise_in_means(10.0) == data.sensor.noise_mbar
-
-
 def test_hum_is_noise() -> None:
     samples = log_of("test_rig").copy()
     hum = 2.0 * MBAR * np.sin(2.0 * np.pi * 50.0 * samples["time_ns"] * 1e-9)

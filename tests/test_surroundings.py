@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 import rigs
 from calibrations import typed
+from second_rigs import samples_of
+from second_world.draw import draw_rig
+from second_world.records import record
 
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
@@ -131,3 +134,23 @@ def test_a_barometer_that_contradicts_is_not_gone_by() -> None:
     assert guess.ambient.pressure_mbar == pytest.approx(990.0, abs=1.0)
     assert "sensor_offset" not in guess.effects
     assert [remark.line.split(" =")[0] for remark in remarks] == ["[data.ambient] pressure_mbar"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("renewed", [1, 2, 5])
+def test_rows_that_repeat_a_reading_are_recognised(name: str, renewed: int) -> None:
+    samples = another_day(name).copy()
+    rows = np.arange(len(samples)) // renewed * renewed
+    samples["pressure"] = samples["pressure"][rows]
+    sensor = taken_in(typed(name).data, samples).sensor
+    assert sensor.renewed_ms == pytest.approx(renewed if renewed > 1 else 0.0, rel=0.15)
+    in_means = sensor.noise_mbar * np.sqrt(renewed)
+    assert sensor.noise_in_means() == pytest.approx(in_means, rel=0.1)
+    assert sensor.noise_in_means(10.0) == sensor.noise_mbar
+
+
+@pytest.mark.parametrize(("seed", "renewed_ms"), [(198205, 2.0), (198215, 5.0), (198203, 0.0)])
+def test_on_rigs_of_another_world_it_is_found_as_well(seed: int, renewed_ms: float) -> None:
+    samples = samples_of(record(draw_rig(seed), seed, 6))
+    sensor = taken_in(typed("test_rig").data, samples).sensor
+    assert sensor.renewed_ms == pytest.approx(renewed_ms, rel=0.1)

@@ -406,7 +406,6 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     tables = data.model_dump()
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
-    tables["sensor"]["renewed_ms"] = readings.renewed / MS
     remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
     tables["system"].update(free_convection=0.5, forced_convection=1.0, leak_critical_ratio=0.4)
     tables["system"]["creep_share"] = CREEPS

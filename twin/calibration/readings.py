@@ -43,9 +43,6 @@ LEAST_WAIT_MS = 15.0  # between them; ramp and sensor take less
 # twice as long to the second as to the first. Between the last two it is steepest.
 GROWING, STEEP = (0.01, 0.04), (0.1, 0.25)
 LEAST_GROWN = 0.05  # least share of the fall between the first two times at the full slope
-# A sensor that is slower than the rows repeats readings where the pressure falls from row to row by
-# more than some steps of the converter. Rows over which that is seen, and share of repeats.
-REPEATS_FOR, REPEATS_STEPS, FEWEST_FALLS, LEAST_REPEATED = 20, 2.0, 30, 0.25
 OPENED_MS = 40.0  # of an idle, over which its pressure is averaged
 OPENED_FROM, OPENED_TO = 0.6, 0.85  # part of an idle in which an opened system is at ambient
 # A blow-off is steady in its last milliseconds, or is not; its valve closes within the others.
@@ -71,7 +68,6 @@ class Readings:
     missing: float  # share of missing rows
     noise: float  # Pa, one standard deviation, steps of the converter included
     step: float  # Pa, the smallest difference between two readings
-    renewed: float  # s, from a new reading to the next; 0 if each row has its own
     idle: float  # Pa, the reading late in an idle: ambient if the system is opened
     opened: bool  # all idles settle at one pressure
     suctions: int
@@ -166,7 +162,6 @@ def read(samples: Samples) -> Readings:
         missing=1.0 - len(rows) / span,
         noise=noise,
         step=step,
-        renewed=_renewed(pressure, suctions, period, step),
         idle=idle,
         opened=opened,
         suctions=len(suctions),
@@ -223,23 +218,6 @@ def noise_of(pressure: Floats, period: float) -> float:
     residual = windows - (windows @ smooth) @ smooth.T
     variance = np.sum(residual**2, axis=1) / (rows - 3)
     return float(np.sqrt(np.quantile(variance, QUIET)))
-
-
-def _renewed(pressure: Floats, suctions: list[Stretch], period: float, step: float) -> float:
-    """Time (s) from a new reading to the next; 0 if each row has its own.
-
-    It shows where suction begins, and the pressure falls by more than steps of the converter.
-    """
-    repeats = list[npt.NDArray[np.bool_]]()
-    for suction in suctions:
-        changes = np.diff(pressure[suction.first : suction.last])
-        if len(changes) >= REPEATS_FOR:
-            falls = -_smoothed(changes, REPEATS_FOR)
-            repeats.append((changes == 0.0)[falls > REPEATS_STEPS * step])
-    repeated = np.concatenate([np.empty(0, bool), *repeats])
-    if len(repeated) < FEWEST_FALLS or not LEAST_REPEATED < repeated.mean() < 1.0:
-        return 0.0
-    return period / (1.0 - float(repeated.mean()))
 
 
 def deep(smooth: Floats, lows: list[int], highs: list[int]) -> tuple[list[int], list[int]]:

@@ -40,6 +40,9 @@ POINTS, PLACES = 192, 61  # points of a thinned window; times at which a break i
 STEP_POINTS = 80
 CLEAR, FIRST = 8.0, 0.6  # least sigmas of a break; an earlier one with this share of them wins
 RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # s; sigmas; times as far away; share
+# A sensor that is slower than the rows repeats readings where the pressure falls from row to row by
+# more than some steps of the converter. Rows over which that is seen, and share of repeats.
+REPEATS_FOR, REPEATS_STEPS, FEWEST_FALLS, LEAST_REPEATED = 20, 2.0, 30, 0.25
 STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # least sigmas of a break with a step; least χ² it must gain
 
 
@@ -72,6 +75,18 @@ def rounding_error(step: float, noise: float) -> float:
     """
     beneath = max(noise**2 - (SHARE_OF_STEP * step) ** 2, 0.0)
     return SHARE_OF_STEP * step * math.exp(-2.0 * math.pi**2 * beneath / step**2) if step else 0.0
+
+
+def renewed_every(pressure: Floats, sucks: npt.NDArray[np.bool_]) -> float:
+    """Rows from a new reading to the next where the pressure falls in suction; 0 if each is new."""
+    changes = np.diff(pressure)
+    if len(changes) < REPEATS_FOR:
+        return 0.0
+    falls = -smoothed(changes, REPEATS_FOR) > REPEATS_STEPS * converter_step(pressure)
+    repeated = (changes == 0.0)[falls & sucks[1:] & sucks[:-1]]
+    if len(repeated) < FEWEST_FALLS or not LEAST_REPEATED < repeated.mean() < 1.0:
+        return 0.0
+    return 1.0 / (1.0 - float(repeated.mean()))
 
 
 def smoothed(pressure: Floats, width: int) -> Floats:

@@ -14,7 +14,9 @@ from twin.model import theta as c
 from twin.model.compiled import compiled
 from twin.model.dataset import DataSet
 from twin.model.theta import Theta
-from twin.signals import MBAR, ZERO_C, Phase, Samples, Ticks, sampling_ms
+from twin.monitor.breakpoints import renewed_every
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, ZERO_C, Command, Phase, Samples, Ticks, sampling_ms
 
 COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
 
@@ -60,14 +62,23 @@ def surrounded(theta: Theta, medians: Mapping[str, float]) -> Theta:
 
 
 def taken_in(data: DataSet, samples: Samples) -> DataSet:
-    """A data set with the sampling of a record, and with its surroundings if measured."""
+    """A data set with the sampling of a record, and with its surroundings if measured.
+
+    Where rows repeat readings, it says how often there is a new one.
+    """
     medians, ambient = told(samples), data.ambient
     if "ambient" in medians:
         ambient = ambient.model_copy(update={"pressure_mbar": round(medians["ambient"] / MBAR, 1)})
     if "temperature" in medians:
         celsius = round(medians["temperature"] - ZERO_C, 1)
         ambient = ambient.model_copy(update={"temperature_c": celsius})
-    sensor = data.sensor.model_copy(update={"sampling_ms": sampling_ms(samples)})
+    usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
+    sucks = (samples["commands"] == Command.SUCTION)[usable]
+    repeats = renewed_every(samples["pressure"][usable].astype(np.float64), sucks)
+    sampling = sampling_ms(samples)
+    sensor = data.sensor.model_copy(
+        update={"sampling_ms": sampling, "renewed_ms": repeats * sampling}
+    )
     updated = data.model_copy(update={"ambient": ambient, "sensor": sensor})
     return DataSet.model_validate(updated.model_dump())
 
