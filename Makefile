@@ -6,7 +6,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help demo test peers check quick hooks format docs bench battery soak fuzz audit coverage clean
+.PHONY: help demo test short peers check quick hooks format docs bench battery soak fuzz audit coverage clean
 
 help:  ## say what there is (this)
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -16,6 +16,9 @@ demo: .venv/run  ## a simulated PLC, a live twin beside it, a leak that opens ha
 
 test: .venv/dev  ## the whole test suite
 	$(PYTEST)
+
+short: .venv/dev  ## the tests that are not marked slow, in ten minutes
+	$(PYTEST) -m "not slow"
 
 # What the tests speak to, if it is there: a broker, a browser, PLCs of other make.
 peers:  ## a broker, a browser and PLCs of other make for the tests

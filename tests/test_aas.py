@@ -170,6 +170,7 @@ def histories(draw: st.DrawFn) -> list[Record]:
     return records
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(records=histories())
 def test_whatever_the_database_holds_comes_back_and_the_shells_conform(

@@ -402,6 +402,7 @@ def test_a_defect_does_not_end_what_is_kept(
     assert said == ["alarms wait in memory: MemoryError: ", "alarms are stored again"]
 
 
+@pytest.mark.slow
 def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> None:
     """The simulated rig with a leak, twice; between the runs somebody acknowledges it."""
 

@@ -75,6 +75,7 @@ def causes(samples: Samples) -> list[dict[str, Any]]:
     return list(found.json["causes"])
 
 
+@pytest.mark.slow
 def test_all_readings_lower_is_weather_or_the_sensor_and_weather_is_likelier() -> None:
     (cause,) = causes(reads_lower())
     assert cause["effect"] == "ambient_pressure"
@@ -82,6 +83,7 @@ def test_all_readings_lower_is_weather_or_the_sensor_and_weather_is_likelier() -
     assert cause["not_separable_from"] == ["sensor_offset"]
 
 
+@pytest.mark.slow
 def test_beside_a_barometer_it_is_the_sensor() -> None:
     samples = reads_lower().copy()
     samples["ambient"] = rigs.theta("gripper")[c.AMBIENT]
@@ -102,6 +104,7 @@ def test_weather_that_somebody_measures_is_no_cheap_cause() -> None:
     assert often(evidence, EFFECTS["sensor_offset"]) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["gripper", "test_rig"])
 def test_weather_moves_h1_where_the_ejector_s_own_sensor_counts_from_zero(rig: str) -> None:
     """What the rig shows then, its levels in vacuum moved as the weather did, is one cause."""

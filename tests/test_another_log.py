@@ -41,6 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_what_was_found_holds_for_another_program(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -66,6 +67,7 @@ def test_of_a_unit_that_has_nothing_nothing_is_judged(
     assert "nothing is judged on it: the data set there is fits already" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_log_without_a_cycle_to_judge_by_is_told(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

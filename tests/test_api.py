@@ -95,6 +95,7 @@ def test_all_that_is_named_is_there_and_what_is_not_is_said() -> None:
 # The documentation.
 
 
+@pytest.mark.slow
 def test_the_tutorial_says_what_happens(tutorial: Read) -> None:
     assert tutorial.said == ""
 
@@ -168,6 +169,7 @@ def commanded(tutorial: Read) -> Path:
     return tutorial.folder
 
 
+@pytest.mark.slow
 def test_a_calibration_is_made_of_what_the_command_makes_it_of(
     tutorial: Read, commanded: Path, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -588,6 +588,7 @@ def next_line(process: "subprocess.Popen[str]") -> str:
     return line
 
 
+@pytest.mark.slow
 def test_two_writers_at_once_lose_nothing(url: str) -> None:
     with writer(url, "left") as left, writer(url, "right") as right:
         told_ids = [list[str](), list[str]()]

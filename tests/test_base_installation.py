@@ -109,6 +109,7 @@ def test_the_base_has_no_package_of_an_extra(base: Run) -> None:
     assert done(base(code="import numba, pymodbus, mcap")) == ""
 
 
+@pytest.mark.slow
 def test_a_first_configuration(base: Run, tmp_path: Path) -> None:
     for name, address in (("cell", "10.0.0.5:502"), ("node", "opc.tcp://plc:4840")):
         path = tmp_path / f"{name}.toml"
@@ -117,6 +118,7 @@ def test_a_first_configuration(base: Run, tmp_path: Path) -> None:
     assert "hil" in done(base("config", "schema"))
 
 
+@pytest.mark.slow
 def test_a_run_beside_a_plc(base: Run, plc: PlcProcess, tmp_path: Path) -> None:
     address = ("--address", f"127.0.0.1:{plc.port}")
     assert "scan" in done(base("probe", GRIPPER, *address))
@@ -124,6 +126,7 @@ def test_a_run_beside_a_plc(base: Run, plc: PlcProcess, tmp_path: Path) -> None:
     assert sum(len(rows) for rows, _ in open_log(tmp_path / "a.mcap").blocks()) > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STARTERS)
 def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: Run) -> None:
     assert str(rigs.ROOT) not in done(wheel(code="import twin; print(twin.__file__)"))
@@ -131,6 +134,7 @@ def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: R
     assert "no mistake" in done(wheel("config", "check", f"{name}.toml"))
 
 
+@pytest.mark.slow
 def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
     done(wheel("init", "rig.toml", "--starter", "gripper"))
     assert "listening" in done(wheel("plc", "rig.toml", "--port", "0", "--duration", "0.1"))
@@ -139,6 +143,7 @@ def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
     assert "state: complete" in done(wheel("log", "check", "a.mcap"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "says"),
     [
@@ -198,6 +203,7 @@ HINTS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extra", "command"), [(extra, hint) for extra, some in HINTS.items() for hint in some]
 )

@@ -34,6 +34,7 @@ def seed_of(commit: str) -> int:
         return 0
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1200)  # two calibrations, on a computer that does other things beside
 def test_first_world() -> None:
     cases = list(first_world(CaseFile(None, {}), seed_of(commit()), COUNTS, 1))
@@ -47,6 +48,7 @@ def test_each_commit_has_seeds_of_its_own() -> None:
     assert not (ROOT / ".git").exists() or commit() != "unknown"  # on the empty path of a test
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1200)  # two commissionings, on a computer that does other things beside
 def test_second_world() -> None:
     """Of the first five seeds those with rows 1 ms apart: a healthy record more, and one effect."""

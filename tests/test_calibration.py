@@ -47,6 +47,7 @@ def instance(name: str) -> Config:
     return replace(config, data=found.fitted.data, monitor=monitor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_what_is_left_on_other_runs_is_near_the_floor(name: str) -> None:
     data = calibrated(name).fitted.data
@@ -82,6 +83,7 @@ def test_the_log_determines_what_it_shows(name: str) -> None:
     assert fitted.data.ejector.response_off_ms == pytest.approx(12.0, abs=0.5)  # the type's
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_true_values_of_other_units() -> None:
     found = []
     for seed in DRAWN:
@@ -114,6 +116,7 @@ def test_nothing_is_known_less_than_before(name: str) -> None:
     assert (np.linalg.eigvalsh(fitted.covariance) > 0.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "seed"), [("test_rig", 31), ("gripper", 32)])
 def test_another_healthy_log_raises_no_alarm_and_is_consistent(name: str, seed: int) -> None:
     config = instance(name)
@@ -168,6 +171,7 @@ def test_a_log_full_of_gaps_is_refused() -> None:
     assert "gaps and" in refused("gripper", samples[rows % 500 < 490])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fault", "parameter"),
     [
@@ -183,6 +187,7 @@ def test_a_unit_that_is_ill_from_the_start_is_refused(
     assert parameter in said
 
 
+@pytest.mark.slow
 def test_a_sensor_far_slower_than_it_is_said_to_be_is_refused() -> None:
     plc = rig("test_rig")
     sensor = plc.sensor.model_copy(update={"lag_ms": 50.0})
@@ -190,6 +195,7 @@ def test_a_sensor_far_slower_than_it_is_said_to_be_is_refused() -> None:
     assert "too round" in said
 
 
+@pytest.mark.slow
 def test_a_leak_that_begins_half_way_is_refused() -> None:
     said = refused("gripper", log_of("gripper", faults=("leakage=2.0@c5",)))
     assert "not alike" in said or "not that of a healthy unit" in said
@@ -205,6 +211,7 @@ def test_cycles_of_a_unit_at_an_effects_bound_are_compared_as_well() -> None:
     refuse_changing(cycles, coefficients(data), data.sensor.noise_mbar * MBAR, [{}, {}])
 
 
+@pytest.mark.slow
 def test_the_log_of_another_system_is_refused() -> None:
     said = refused("gripper", log_of("test_rig", cycles=FEW))
     assert "cannot follow this log" in said or "not that of a healthy unit" in said

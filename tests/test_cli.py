@@ -307,6 +307,7 @@ def not_ignored(number: signal.Signals) -> Iterator[None]:
         signal.signal(number, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_ends_it_with_130_and_a_finished_log(
     plc: PlcProcess, tmp_path: Path, number: signal.Signals
@@ -331,6 +332,7 @@ def until(done: Callable[[], bool], process: "subprocess.Popen[str]") -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_who_reads_what_it_says_may_go_and_it_goes_on(plc: PlcProcess, tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
     with started(*run_beside(plc, log)) as process:
@@ -345,6 +347,7 @@ def test_who_reads_what_it_says_may_go_and_it_goes_on(plc: PlcProcess, tmp_path:
     assert open_log(log).complete
 
 
+@pytest.mark.slow
 def test_a_reader_that_takes_nothing_holds_nothing_up(plc: PlcProcess, tmp_path: Path) -> None:
     """As a paused pager does: the pipe is full before the run says its first word."""
     log, (reads, writes) = tmp_path / "a.mcap", os.pipe()
@@ -373,6 +376,7 @@ def test_a_reader_that_takes_nothing_holds_nothing_up(plc: PlcProcess, tmp_path:
     os.close(writes)
 
 
+@pytest.mark.slow
 def test_a_file_that_may_grow_no_more_is_followed_by_another(
     plc: PlcProcess, tmp_path: Path
 ) -> None:
@@ -458,6 +462,7 @@ def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
     assert "log_deleted" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("used", "left"), [(79_000, 2), (81_000, 1)])
 def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(
     plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: int, left: int
@@ -472,6 +477,7 @@ def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(
     assert (tmp_path / "b.mcap").exists()
 
 
+@pytest.mark.slow
 def test_a_plc_that_restarts_is_told_and_followed_on(tmp_path: Path) -> None:
     log = tmp_path / "a.mcap"
     with start_plc(GRIPPER) as first, started(*run_beside(first, log)) as process:

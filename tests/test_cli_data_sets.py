@@ -289,6 +289,7 @@ def test_a_diagnosis_judges_by_the_data_set_of_the_log_or_the_unit_that_is_named
     assert about(here / "unit.mcap", "data_set") in (here / "short2.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_unit_that_is_calibrated_is_the_one_that_is_replayed(
     log: Path,
     here: Path,

@@ -78,6 +78,7 @@ def commissioned() -> Commissioned:
     return commission(config_of(of.truth.readable), [samples_of(of)], quiet)
 
 
+@pytest.mark.slow
 def test_a_rig_of_another_world_is_fitted_from_what_a_person_reads_off() -> None:
     found = commissioned()
     assert found.verdict.residuals[Phase.SUCTION].times < 2.0
@@ -352,6 +353,7 @@ def test_a_fit_keeps_both_ways_in_which_a_part_leaves() -> None:
     assert [start.cost for start in _kept(begun, 1)] == [8]
 
 
+@pytest.mark.slow
 def test_the_shipped_gripper_is_followed_through_its_hose() -> None:
     """Its sensor is at the ejector, and its cups are behind two metres of hose."""
     samples, _ = rigs.recorded("gripper", 16.0, seed=1)
@@ -420,6 +422,7 @@ def test_a_fit_starts_with_lips_that_spread_and_bellows_that_fold_where_there_ar
 # What is named on it.
 
 
+@pytest.mark.slow
 def test_a_jet_that_rises_slowly_is_named_or_stands_beside_what_is() -> None:
     of, found = logged(SEED, KIND), commissioned().calibration
     config = config_of(of.truth.readable)

@@ -90,6 +90,7 @@ def test_a_folder_in_one_that_all_may_write_to_is_refused(tmp_path: Path) -> Non
         private_folder(tmp_path / "guessable")
 
 
+@pytest.mark.slow
 def test_a_step_is_taken_for_several_hypotheses_at_a_time() -> None:
     """One at a time they take three times as long, which nothing else would tell."""
     theta = np.stack([rigs.theta("test_rig")] * kernel.LANES, axis=1)

@@ -52,6 +52,7 @@ def read(
     return expected, signals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft_and_late", [False, True])
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_whole_cycle_is_within_half_a_pascal_of_the_exact_solution(

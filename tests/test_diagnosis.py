@@ -82,6 +82,7 @@ def test_a_log_whose_clock_begins_at_zero_is_told_in_seconds_since_its_beginning
 # sizes and courses by seed, are in tools/battery_first.py.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -119,6 +120,7 @@ def hummed_unit(name: str) -> battery_first.Unit:
     return battery_first.Unit(name, plc, replace(config, data=found.fitted.data, monitor=monitor))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [90001, 90002])
 def test_a_healthy_record_of_a_coarse_input_with_hum_is_consistent(
     seed: int, monkeypatch: pytest.MonkeyPatch
@@ -140,6 +142,7 @@ def confirmed(diagnosis: Diagnosis, *causes: Cause) -> Hypothesis:
     return () if left is None else left.hypothesis
 
 
+@pytest.mark.slow
 def test_a_cause_without_a_gain_on_unseen_cycles_is_none() -> None:
     """Neither alone nor beside another; whatever it gained on those it was fitted to."""
     leak = with_leak()
@@ -238,6 +241,7 @@ def test_the_interval_of_a_gain_has_a_width_or_there_is_none() -> None:
     assert (nothing["rms_reduction_pct"], nothing["low95"], nothing["high95"]) == (0.0, None, None)
 
 
+@pytest.mark.slow
 def test_drifted_thresholds_gain_in_the_switching_levels() -> None:
     """The pressure between switchings begins at what was measured there."""
     answer = of(record(30.0, "threshold_drift=-25", seed=35)).json
@@ -247,6 +251,7 @@ def test_drifted_thresholds_gain_in_the_switching_levels() -> None:
     assert before > 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_mbar", [3.0, 75.0])
 def test_a_hysteresis_that_nobody_knows_is_no_drift_where_a_leak_shows_it(
     known_mbar: float,
@@ -301,6 +306,7 @@ def test_what_a_cause_gets_wrong_says_nothing_about_cycles_without_it() -> None:
     assert with_error > 1.5 * alone
 
 
+@pytest.mark.slow
 def test_what_grows_to_a_great_size_comes_first_with_its_course() -> None:
     """By a linear model, a filter that clogs to many times what is usual looks like weather."""
     evidence = collect(CONFIG, record(40.0, "filter_clogging=130/ramp:39", seed=24))
@@ -313,6 +319,7 @@ def test_what_grows_to_a_great_size_comes_first_with_its_course() -> None:
     assert first.kind == {("filter_clogging", Course.RAMP)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "plc", "lag"), [(CONFIG, PLC, 60.0), (GRIPPER, GRIPPER_PLC, 100.0)]
 )
@@ -328,6 +335,7 @@ def test_a_sensor_too_slow_for_the_live_twin_to_see_every_knee_is_found_whole(
     assert answer["gain"]["share_of_achievable_pct"] > 90
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [41, 42])
 def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed: int) -> None:
     """A gripper's leak has it go off twice a suction, which no healthy cycle shows."""
@@ -337,6 +345,7 @@ def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed
     assert answer["extended"]["leftover_sigma"] < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flow", [4.0, 5.4])
 def test_a_valve_whose_closing_no_healthy_cycle_shows_is_nothing_unlisted(flow: float) -> None:
     """Suctions of a leaking gripper end with the nozzle on; healthy ones all end in a hold."""
@@ -354,6 +363,7 @@ def no_mechanism(*_known: Any) -> None:
     """What is found where none explains most of what is off."""
 
 
+@pytest.mark.slow
 def test_what_no_mechanism_explains_gets_a_term_that_takes_it_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -528,6 +538,7 @@ def test_few_rows_draw_the_same_curve_as_all() -> None:
     assert few.off(causes) == pytest.approx(every.off(causes), abs=1.0)  # mbar
 
 
+@pytest.mark.slow
 def test_an_offset_that_comes_and_goes_does_not_move_the_level_before_it() -> None:
     answer = of(record(30.0, "sensor_offset=13/every:3", seed=29)).json
     (cause,) = answer["causes"]
@@ -535,6 +546,7 @@ def test_an_offset_that_comes_and_goes_does_not_move_the_level_before_it() -> No
     assert answer["verdict"] == "explained"
 
 
+@pytest.mark.slow
 def test_what_comes_in_every_second_cycle_is_fitted_and_judged() -> None:
     answer = of(record(34.0, "leakage=1.5/every:2", seed=30)).json
     (cause,) = answer["causes"]
@@ -632,6 +644,7 @@ def test_two_groups_of_cycles_are_apart_where_both_have_some(
     assert np.flatnonzero(apart(np.array(squares))).tolist() == upper
 
 
+@pytest.mark.slow
 def test_thresholds_that_come_and_go_are_found_by_the_levels() -> None:
     log = recorded(GRIPPER_PLC, 8, 31, [parse_fault("threshold_drift=-25/every:3")])
     answer = of(iter([log]), GRIPPER).json
@@ -647,6 +660,7 @@ def test_a_threshold_that_is_never_reached_is_no_excuse() -> None:
     assert (np.abs(levels(evidence, evidence.judged, [HEALTHY])) < 10.0).all()
 
 
+@pytest.mark.slow
 def test_what_another_heat_exchange_leaves_for_the_next_cycle_is_counted() -> None:
     # Also what acted in the first cycle, which is not judged.
     log = recorded(GRIPPER_PLC, 9, 33, [parse_fault("heat_exchange=32/every:3")])
@@ -769,6 +783,7 @@ def test_of_a_long_log_some_cycles_are_looked_at_as_in_the_whole() -> None:
         assert here == pytest.approx(off[0][whole.bins.cycle == number], abs=0.1)  # mbar
 
 
+@pytest.mark.slow
 def test_a_step_in_a_long_log_begins_when_all_cycles_say(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin.diagnosis.answer.MOST_JUDGED", 6)
     (cause,) = of(record(66.0, "leakage=1.5@31.3", seed=27)).json["causes"]

@@ -155,6 +155,7 @@ def test_without_a_price_or_a_size_nothing_is_told() -> None:
     assert "cost" not in lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", [PRICE, ""])
 def test_a_diagnosis_has_it_in_text_answer_and_report_where_a_price_is(extra: str) -> None:
     samples, _ = rigs.recorded("test_rig", 20.0, (f"leakage={LEAK}",))

@@ -21,6 +21,7 @@ MODULES += [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", MODULES)
 def test_a_module_comes_without_what_only_linux_has(module: str) -> None:
     code = f"{LACKS}import {module}"

@@ -70,6 +70,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
 # From log to log.
 
 
+@pytest.mark.slow
 def test_it_is_stored_as_a_unit_with_where_it_is_from(saved: Saved) -> None:
     with open_assets(saved.assets) as database:
         (record,) = database.records("instance", "leaky")

@@ -51,6 +51,7 @@ def begun_ns(seen: Collect, begins_s: float) -> int:
     return int(seen.samples[0]["time_ns"][0]) + round(begins_s * 1e9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_no_cause_is_named_from_the_cycle_in_which_a_fault_began(seed: int) -> None:
     name, effect, fault, begins_s = drawn(seed)

@@ -17,6 +17,7 @@ from twin.quality import Quality
 from twin.signals import MBAR, TICK, Samples
 
 
+@pytest.mark.slow
 def test_after_every_disturbance_the_log_is_true_and_the_twin_right(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +113,7 @@ def test_a_part_without_an_end_is_seen(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["the disk is full", "the folder of the log is deleted"])
 def test_disk_faults_cost_no_row(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -56,6 +56,7 @@ def of(found: Savings, h1: float, hysteresis: float, supply: float = 5.0) -> Pre
     return next(prediction for prediction in found.others if prediction.setting == setting)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize(("h1", "hysteresis"), [(710.0, 150.0), (700.0, 100.0)])
 def test_the_rig_set_so_takes_as_much_less(name: str, h1: float, hysteresis: float) -> None:

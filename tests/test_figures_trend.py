@@ -287,6 +287,7 @@ def test_what_follows_a_step_is_a_record_of_its_own() -> None:
     assert trend.comes.expected == pytest.approx(10.0, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("correlation", "most"), [(0.0, 0.04), (0.9, 0.05), (0.99, 0.07)])
 def test_scatter_is_seldom_called_a_step(correlation: float, most: float) -> None:
     """One in a hundred is what is asked for."""

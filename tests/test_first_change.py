@@ -65,6 +65,7 @@ def clone(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # the copy compiles the model once more
 @pytest.mark.needs("git")
 def test_whoever_follows_the_page_has_added_an_effect(clone: Path) -> None:

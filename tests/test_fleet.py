@@ -46,6 +46,7 @@ def answers(path: Path) -> dict[str, Any]:
     return {Path(log["log"]).name: log for log in json.loads(path.read_text())["logs"]}
 
 
+@pytest.mark.slow
 def test_each_log_is_worked_on_once(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +151,7 @@ def test_commissioning_says_that_its_record_was_cut_off(
     assert f"twin: {log} is not complete; what can be read is used" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_units_are_calibrated_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,6 +221,7 @@ def test_a_killed_process_costs_only_its_log(
     assert f"{DIES}-9.mcap: the process that worked on it was killed" in said.err
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ def effects(name: str, *faults: str) -> dict[str, dict[str, float]]:
 
 
 # A delay of a row or less moves only the edges, and the rows at which switching is seen.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "size"),
     [

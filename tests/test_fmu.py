@@ -55,6 +55,7 @@ def parts(fmu: fmus.Fmu) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
+@pytest.mark.slow
 @pytest.mark.needs("cc")
 @pytest.mark.parametrize(("version", "where"), ALL)
 def test_fmpy_finds_nothing(version: int, where: Where) -> None:
@@ -63,6 +64,7 @@ def test_fmpy_finds_nothing(version: int, where: Where) -> None:
         assert read_model_description(path).coSimulation.canGetAndSetFMUstate
 
 
+@pytest.mark.slow
 @pytest.mark.needs("cc")
 @pytest.mark.parametrize(
     ("name", "version", "fault"),

@@ -39,6 +39,7 @@ def test_the_papers_model_misses_cycles_by_far() -> None:
     assert rms(off(rig().nominal, rig().unseen)) > 40.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", ["fitted, wall heat", "fitted, bends"])
 def test_wall_heat_and_bends_are_both_needed(alone: str) -> None:
     both, one = left("fitted, both"), left(alone)

@@ -100,6 +100,7 @@ def test_what_follows_contact_comes_later_as_a_whole() -> None:
     assert by_contact(bins, here, rows, expected, on_the_part, MS).shape == (len(here), 0)
 
 
+@pytest.mark.slow
 def test_a_rig_of_another_world_that_meets_the_part_late_is_healthy() -> None:
     """Cups come upon the part 60 ms after suction began; one sigma of that is 2 ms.
 

@@ -511,6 +511,7 @@ def poll_mode(tables: dict[str, Any]) -> None:
     tables["driver"] |= {"mode": "poll"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [lambda _: None, poll_mode], ids=["block", "poll"])
 def test_beside_a_plc_only_reading_function_codes_are_sent(
     change: Callable[[dict[str, Any]], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -526,6 +527,7 @@ def test_beside_a_plc_only_reading_function_codes_are_sent(
     assert {function for function, _ in requests} <= {1, 2, 3, 4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "asked"), [("block", READ_REQUEST), ("subscribe", PUBLISH_REQUEST)]
 )
@@ -545,6 +547,7 @@ def test_beside_an_opcua_server_no_write_is_sent(
         assert WRITE_REQUEST in [service for sent in tap.sent for service in opcua_services(sent)]
 
 
+@pytest.mark.slow
 def test_in_the_loop_only_what_is_listed_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -563,6 +566,7 @@ def test_in_the_loop_only_what_is_listed_is_written(
     assert 3 in {code for code, _ in requests}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "code", "complaint"),
     [
@@ -635,6 +639,7 @@ def commands(port: int, unit: int) -> int:
     return status(port, unit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["test_rig", "test_rig_opcua"])
 def test_a_plcs_program_runs_on_the_models_answers(name: str, tmp_path: Path) -> None:
     """Its picks wait for H2; when the twin is killed, its watchdog drops everything."""
@@ -672,6 +677,7 @@ def test_a_plcs_program_runs_on_the_models_answers(name: str, tmp_path: Path) ->
         assert 0 <= saw - present[present <= saw][-1] < 200
 
 
+@pytest.mark.slow
 def test_two_ejectors_of_one_plc_are_each_in_the_loop_with_a_model_of_their_own(
     tmp_path: Path,
 ) -> None:
@@ -703,6 +709,7 @@ def test_two_ejectors_of_one_plc_are_each_in_the_loop_with_a_model_of_their_own(
         assert anew.astype(np.float32).tobytes() == rows["pressure"].tobytes()
 
 
+@pytest.mark.slow
 def test_the_log_of_a_loop_replays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, log = configured(tmp_path, "test_rig", lambda _: None), tmp_path / "a.mcap"
     with start_plc(config) as plc:

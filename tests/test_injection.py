@@ -255,6 +255,7 @@ def first_and_last(sites: Sequence[Site]) -> list[tuple[int, Callable[[], Except
     ]
 
 
+@pytest.mark.slow
 def test_whatever_call_of_the_log_fails_no_row_is_lost(folder: Callable[[], Path]) -> None:
     without = Run(folder(), calls := Calls())
     samples, ticks, events = without.logged()
@@ -377,6 +378,7 @@ class Beside:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_whatever_call_of_an_output_fails_the_run_goes_on_and_tells(
     output: str, folder: Callable[[], Path], monkeypatch: pytest.MonkeyPatch

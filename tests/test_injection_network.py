@@ -114,6 +114,7 @@ def test_whatever_network_call_of_the_driver_fails_no_row_is_lost(
 # --- the webhook ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_whatever_network_call_of_the_webhook_fails_no_alarm_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

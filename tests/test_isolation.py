@@ -57,6 +57,7 @@ def probabilities(told: Sequence[Event]) -> dict[int, dict[str, float]]:
 
 
 # All are far below what a single cycle's figures show (six sigma).
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "size"),
     [
@@ -83,6 +84,7 @@ def test_a_small_fault_is_found_within_cycles_and_named(
     assert last[effect] > (0.9 if EFFECTS[effect].often == 1.0 else 0.85)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("seed", [21, 22])
 def test_healthy_cycles_are_probably_nothing(name: str, seed: int) -> None:

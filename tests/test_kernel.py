@@ -245,6 +245,7 @@ def test_the_models_own_air_saving_keeps_between_its_levels() -> None:
     assert (vacuum[on - 1] >= theta[c.H1_LOW]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [c.EXTERNAL, c.INTERNAL, c.TIMED])
 @pytest.mark.parametrize("hypotheses", [1, 3])
 @settings(deadline=None, max_examples=15)

@@ -169,6 +169,7 @@ def test_switching_levels_are_held_against_healthy_ones(unit: Unit) -> None:
 # --- answers --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_leak_in_clean_features_is_recognised(learned: Learned) -> None:
     answer = learned.answer(made("leakage", 4.0, 9001).features)
     (cause,) = answer["causes"]

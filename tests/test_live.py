@@ -240,6 +240,7 @@ def test_a_replay_of_a_replay_is_the_same(tmp_path: Path) -> None:
 # End to end.
 
 
+@pytest.mark.slow
 def test_beside_a_plc_nothing_is_lost_and_the_twin_follows(plc: PlcProcess) -> None:
     """Over Modbus from another process, for two whole cycles."""
     seen = Collect()
@@ -259,6 +260,7 @@ def test_beside_a_plc_nothing_is_lost_and_the_twin_follows(plc: PlcProcess) -> N
     assert np.median(follows[in_suction]) < 1500  # Pa
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_nothing_is_compiled_while_the_loop_runs(name: str) -> None:
     """It would take seconds, in which nothing is read and nobody is told anything."""

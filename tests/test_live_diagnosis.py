@@ -484,6 +484,7 @@ def beside(plc: PlcProcess, log: Path, seconds: float) -> tuple[str | Path, ...]
     return "run", GRIPPER, "--address", address, "--log", log, "--duration", str(seconds)
 
 
+@pytest.mark.slow
 def test_beside_a_plc_the_alarm_is_diagnosed_without_a_lost_sample(
     leaky_plc: PlcProcess,
     tmp_path: Path,
@@ -513,6 +514,7 @@ def test_beside_a_plc_the_alarm_is_diagnosed_without_a_lost_sample(
     assert "deviation" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_it_is_waited_for_leaves_a_readable_log(
     leaky_plc: PlcProcess, tmp_path: Path
 ) -> None:

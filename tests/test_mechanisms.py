@@ -173,6 +173,7 @@ def iced() -> tuple[battery_first.Unit, battery_first.Hidden, Diagnosis]:
     return unit, hidden, diagnose(unit.config, [samples], "ice.mcap", lambda _: None)
 
 
+@pytest.mark.slow
 def test_what_nobody_listed_becomes_a_nozzle_that_gives_less_the_longer_it_runs() -> None:
     _, _, diagnosis = iced()
     answer = diagnosis.json
@@ -222,6 +223,7 @@ def test_the_phase_of_a_swing_is_proposed_for_no_other_log() -> None:
     assert (ranges["shift"]["low"], ranges["shift"]["high"]) == (0.0, 120.0)
 
 
+@pytest.mark.slow
 def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
     """Taken in as an effect, it is found like any other: by its name, with its size."""
     unit, hidden, diagnosis = iced()
@@ -262,6 +264,7 @@ def swung() -> tuple[Evidence, Explained]:
     return evidence, explained
 
 
+@pytest.mark.slow
 def test_a_supply_that_swings_is_named_with_its_period_and_its_size() -> None:
     """No fit reached it from periods a factor of 1.6 apart: the line is 0.04 Hz wide."""
     _, explained = swung()
@@ -305,6 +308,7 @@ def test_what_only_grows_where_a_listed_cause_acts_is_that_cause(
     assert is_a_course_of(rigs.theta("test_rig"), Cause(mechanism, {}), Cause(cause, {})) is same
 
 
+@pytest.mark.slow
 def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
     """They explain a little ice to 5.5 mbar; on longer suction they made the twin worse."""
     unit, _, samples = battery_first.drawn_case("unlisted", 910008, 2)
@@ -314,6 +318,7 @@ def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
     assert answer["gain"]["share_of_achievable_pct"] > 90.0
 
 
+@pytest.mark.slow
 def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
     """A porous leak explains a lip that lifts to 4.8 mbar; healthy cycles have 2.8."""
     unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900000, 2)

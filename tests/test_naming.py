@@ -25,6 +25,7 @@ def beside(name: str, fault: str) -> tuple[Theta, Samples, Ticks]:
     return rigs.theta(name), samples, ticks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("fault", ["leakage=2.0", "response_delay=20.0"])
 def test_few_rows_say_what_all_of_them_do(

@@ -27,6 +27,7 @@ def run_without(need: str, *options: str, ci: str = "") -> "subprocess.Completed
     )
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)  # all tests are collected once more
 def test_without_any_program_nothing_fails_and_a_table_says_what_is_left_out() -> None:
     done = run_without("all")
@@ -38,6 +39,7 @@ def test_without_any_program_nothing_fails_and_a_table_says_what_is_left_out() -
         assert re.search(rf"^ *[1-9]\d*  {re.escape(name)} +{packages} +\S", table, re.M), name
 
 
+@pytest.mark.slow
 def test_several_processes_say_together_what_is_left_out() -> None:
     done = run_without("cc", "-n", "2", "tests/test_bench_kernel.py", "tests/test_translate.py")
     assert done.returncode == 0, done.stdout

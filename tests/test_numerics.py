@@ -76,6 +76,7 @@ def between_samples(name: str, soft_and_late: bool) -> Theta:
 # Accuracy.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft_and_late", [False, True])
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_whole_cycle_is_within_half_a_pascal_of_the_exact_solution(
@@ -144,6 +145,7 @@ def test_so_are_nodes_that_take_the_temperature_of_their_wall_within_a_step(
     assert expected == pytest.approx(exact, abs=0.1 * MBAR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [TANK, HOSE], ids=["tank", "hose"])
 def test_the_scheme_is_of_third_order(parts: object) -> None:
     theta = closed(parts, tube_film_coefficient=60.0, film_coefficient=10.0, leak_sl_min=0.3)

@@ -331,6 +331,7 @@ def test_revised_intervals_and_dropped_connections(
 # --- restarts -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_restart_with_another_namespace_index_is_survived(tmp_path: Path) -> None:
     plc = started(tmp_path, namespace_index=2)
     with closing(blocks(plc.settings(timeout_ms=500))) as source:

@@ -99,6 +99,7 @@ def over_opcua(plc: tuple[str, int, str], mode: str) -> Samples:
         return taken(source, 1500 if mode == "block" else 600)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["modbus block", "modbus poll", "opcua block", "opcua subscribe"])
 def test_each_way_brings_what_is_reported(plc: tuple[str, int, str], way: str) -> None:
     transport, mode = way.split()

@@ -357,6 +357,7 @@ def publishers(running: Broker, count: int, closing: ExitStack) -> list[Mqtt]:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.needs("mosquitto")
 def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> None:
     leak = Message("1", LEAK, alarm(Unit(TYPE, "cell-17")))
@@ -405,6 +406,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         assert [address for address in asked if not address.startswith(url)] == []
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe", "mosquitto")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_violation_and_a_german_browser_reads_german(
@@ -429,6 +431,7 @@ def test_axe_finds_no_violation_and_a_german_browser_reads_german(
         context.close()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("mosquitto")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_is_fit_for_gloves_on_every_screen(
@@ -461,6 +464,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
 # --- on the command line ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.needs("mosquitto")
 def test_twin_run_is_on_the_page_of_twin_serve(tmp_path: Path) -> None:
     """A real PLC's process, the edge's, the broker's and the page's; the edge is killed."""

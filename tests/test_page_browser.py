@@ -150,6 +150,7 @@ def deeds(page: Page) -> Locator:
     return card(page).get_by_role("button").filter(has_not_text="Show its curve")
 
 
+@pytest.mark.slow
 def test_the_light_follows_the_alarm_and_every_tab_sees_who_took_care(site: Site) -> None:
     mine, theirs = site.open(), site.open()
     site.log_in(mine)
@@ -191,6 +192,7 @@ def test_the_first_view_needs_less_than_500_kb(site: Site) -> None:
     assert sum(loaded.values()) < 500e3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("site", [3], indirect=True)
 def test_it_opens_on_what_is_worst_and_lists_all_alarms_worst_first(site: Site) -> None:
     low, leaking, stale = site.runs
@@ -224,6 +226,7 @@ def test_it_opens_on_what_is_worst_and_lists_all_alarms_worst_first(site: Site) 
     expect(cards).to_have_count(3)
 
 
+@pytest.mark.slow
 def test_a_comment_is_read_by_everybody(site: Site) -> None:
     mine, theirs = site.open(size="phone"), site.open()
     site.log_in(mine)
@@ -275,6 +278,7 @@ def forms(text: Any) -> tuple[str, ...]:
     return (text,) if isinstance(text, str) else tuple(text)
 
 
+@pytest.mark.slow
 def test_a_german_browser_reads_german(site: Site) -> None:
     page = site.open(size="phone", locale="de-DE")
     site.run.suck(1.0)
@@ -295,6 +299,7 @@ def test_a_german_browser_reads_german(site: Site) -> None:
     expect(page.get_by_role("tab", name="History")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_what_is_shelved_says_until_when_and_can_be_unshelved(site: Site) -> None:
     page = site.open()
     site.log_in(page)
@@ -351,6 +356,7 @@ def test_only_what_the_role_allows_can_be_pressed(site: Site, tmp_path: Path) ->
     expect(page.get_by_role("button", name="Out of service, until")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_request_waits_for_a_run_and_the_page_says_so(site: Site) -> None:
     page = site.open()
     site.log_in(page)
@@ -698,6 +704,7 @@ def change_limit(site: Site, page: Page, title: str, value: str, reason: str) ->
     site.until(page, lambda: said.text_content() not in ("", None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("site", [2], indirect=True)
 def test_a_limit_is_changed_with_who_and_why_and_set_back(site: Site) -> None:
     mine, theirs = site.open(), site.open()
@@ -750,6 +757,7 @@ def test_a_limit_is_changed_by_keyboard_and_a_wrong_one_is_not_sent(site: Site) 
     expect(page.locator("article.change")).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_a_change_of_a_limit_waits_for_a_run_and_the_page_says_so(site: Site) -> None:
     page = site.open()
     site.log_in(page)
@@ -779,6 +787,7 @@ def test_text_from_outside_is_text(site: Site) -> None:
     assert page.locator("main img").count() == 0
 
 
+@pytest.mark.slow
 def test_without_its_server_the_page_does_not_stay_green(site: Site) -> None:
     page = site.open()
     site.until_light(page, "green")
@@ -825,6 +834,7 @@ def _luminance(colour: str) -> float:
     return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
@@ -862,6 +872,7 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
         expect(page.locator(dialog)).to_be_hidden()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site, scheme: str) -> None:
@@ -873,6 +884,7 @@ def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site, scheme: 
     assert violations(page) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None:
     site.run.leak()

@@ -76,6 +76,7 @@ def highest(page: Page) -> float:
     return float(page.evaluate("Math.max(...past.curve.measured_high)"))
 
 
+@pytest.mark.slow
 def test_an_old_alarm_leads_to_its_curve_closer_and_back_to_live(logged: Site) -> None:
     page = logged.open()
     logged.run.suck(5.0)
@@ -108,6 +109,7 @@ def test_an_old_alarm_leads_to_its_curve_closer_and_back_to_live(logged: Site) -
     expect(page.locator("#window")).to_have_value("10")
 
 
+@pytest.mark.slow
 def test_an_alarm_of_the_list_leads_to_its_curve_with_who_has_acknowledged_it(logged: Site) -> None:
     page = logged.open()
     logged.log_in(page)
@@ -122,6 +124,7 @@ def test_an_alarm_of_the_list_leads_to_its_curve_with_who_has_acknowledged_it(lo
     assert marks(page)[-1] == "Leakage: acknowledged"
 
 
+@pytest.mark.slow
 def test_presets_beyond_the_ring_end_now_and_a_gap_is_shown(logged: Site, begin: int) -> None:
     page = logged.open()
     opened = time.time()
@@ -145,6 +148,7 @@ def test_presets_beyond_the_ring_end_now_and_a_gap_is_shown(logged: Site, begin:
     assert span(page) == pytest.approx(60.0)
 
 
+@pytest.mark.slow
 def test_a_person_types_a_range(logged: Site) -> None:
     page = logged.open()
     logged.run.suck(2.0)
@@ -186,6 +190,7 @@ def test_without_logs_the_page_says_how_to_have_some(site: Site) -> None:
     expect(page.locator("#curve-said")).to_contain_text("twin run --log FOLDER")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_screen_has_room_for_an_old_curve(logged: Site, scheme: str) -> None:
     for size in SIZES:
@@ -196,6 +201,7 @@ def test_every_screen_has_room_for_an_old_curve(logged: Site, scheme: str) -> No
         page.context.close()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_violation_beside_an_old_curve(logged: Site, scheme: str) -> None:

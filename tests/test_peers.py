@@ -301,6 +301,7 @@ def scans_of(truth: Truth, rows: Samples) -> Any:
     return begins[(right.sum(axis=1) + exactly).argmax()] + since
 
 
+@pytest.mark.slow
 def test_what_it_serves_comes_complete_in_order_and_right(
     peer: Peer, settings: DriverSettings
 ) -> None:
@@ -323,6 +324,7 @@ def test_what_is_not_there_is_told_in_one_sentence(peer: Peer, settings: DriverS
     assert peer.complaint in str(refused(peer.wrong(settings)))
 
 
+@pytest.mark.slow
 def test_killed_and_started_again_it_is_found_again(peer: Peer, tmp_path: Path) -> None:
     furnished(tmp_path)
     with peer.start(tmp_path, 0) as server:

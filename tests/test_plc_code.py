@@ -200,6 +200,7 @@ def assert_whole(samples: Samples, plc: Plc, late: int) -> None:
     assert not (samples["quality"] & (Quality.GAP | Quality.RESTART | Quality.BAD)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 65_000, WRAP - 3000])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_driver_follows_the_registers_and_loses_nothing(

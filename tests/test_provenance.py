@@ -62,6 +62,7 @@ def digest(path: Path) -> bytes:
     return sha256(path.read_bytes()).digest()
 
 
+@pytest.mark.slow
 def test_no_file_is_that_of_an_installed_package() -> None:
     assert copies(our_files(), INSTALLED) == {}
 
@@ -215,6 +216,7 @@ def allowed_for(path: Path) -> set[str]:
     return base.union(*(declared(EXTRAS[extra]) for extra in extras))
 
 
+@pytest.mark.slow
 def test_what_is_imported_is_declared_where_it_is_needed() -> None:
     providers = packages_distributions()
     modules = [file for folder in OURS for file in files(ROOT / folder) if file.suffix == ".py"]

@@ -151,6 +151,7 @@ def twin_lines(name: str) -> Iterator[tuple[str, bool]]:
             yield match[1], False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "CHANGELOG.md"])
 def test_command_lines_are_those_of_the_program(name: str) -> None:
     for line, whole in twin_lines(name):

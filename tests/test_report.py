@@ -294,6 +294,7 @@ class Outline(HTMLParser):
 # --- the page -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_page_needs_nothing_from_outside(verdict: str, pages: dict[str, str]) -> None:
     page = pages[verdict]
@@ -493,6 +494,7 @@ def german(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return pages
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["explained", "two", "some", "part", "unlisted", "consistent"])
 def test_a_german_page_is_german_in_each_word_and_number(name: str, german: dict[str, str]) -> None:
     text = visible(german[name])
@@ -935,6 +937,7 @@ def test_ends_of_an_interval_are_told_apart() -> None:
     assert when(late, NO_CLOCK, interval=True).endswith("(95 %: 12 min 34.1 s to 12 min 34.3 s)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("held_out", "reduction", "why"),
     [

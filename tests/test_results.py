@@ -562,6 +562,7 @@ def test_a_client_that_hangs_holds_up_nobody(
     assert loop.longest_s < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 @pytest.mark.parametrize("policy", ["Basic256Sha256", "Aes256Sha256RsaPss"])
 def test_node_opcua_comes_in_protected(tmp_path: Path, policy: str) -> None:
@@ -623,6 +624,7 @@ def test_beside_a_plc_the_results_follow(server: ResultsServer) -> None:
     assert sink.health.standing is Standing.STOPPED
 
 
+@pytest.mark.slow
 def test_twin_run_serves_them_to_whoever_asks(tmp_path: Path) -> None:
     port = free_port()
     tables = tomllib.loads(rigs.path_of("test_rig").read_text(encoding="utf-8"))

@@ -110,6 +110,7 @@ def told(sink: Results, stream: Stream) -> None:
     stream.said = []
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_an_alarm_comes_with_what_is_compared(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("rig", ""), Stream()
@@ -179,6 +180,7 @@ def test_a_renamed_alarm_goes_on_under_its_new_name(server: ResultsServer, tmp_p
     assert (now["ConditionName"], states(now)) == ("deviation_suction_loss", (True, False, True))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_who_comes_later_is_told_what_stands(server: ResultsServer, tmp_path: Path) -> None:
     before = Stream()
@@ -239,6 +241,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keeper_module, "POLL_S", 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 @pytest.mark.usefixtures("quick")
 def test_who_is_allowed_to_acknowledges_and_others_are_not(tmp_path: Path) -> None:

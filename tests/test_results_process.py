@@ -122,6 +122,7 @@ def stopped(server: ResultsServer) -> str:
     return "it did not answer, and was ended"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [killed, stopped])
 def test_a_server_that_dies_is_told_of_and_comes_back_with_what_it_showed(
     end: Callable[[ResultsServer], str], monkeypatch: pytest.MonkeyPatch

@@ -250,6 +250,7 @@ def kinds(log: Log) -> set[Kind]:
     return {event.kind for event in log.events()}
 
 
+@pytest.mark.slow
 def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
     """Two on one PLC over one connection, and one on another PLC, which dies and comes back."""
     gripper = rigs.path_of("gripper")
@@ -297,6 +298,7 @@ def over_opcua(url: str, prefix: str, unit: int) -> Callable[[dict[str, Any]], N
     return change
 
 
+@pytest.mark.slow
 def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
     names = ("left", "right")
 
@@ -353,6 +355,7 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_plcs_that_are_off_when_the_twin_starts_are_read_once_they_are_on(tmp_path: Path) -> None:
     """By Modbus and by OPC UA, as after a power cut that the edge was the first to survive."""
     modbus, opcua = free_port(), free_port()
@@ -379,6 +382,7 @@ def test_plcs_that_are_off_when_the_twin_starts_are_read_once_they_are_on(tmp_pa
         assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
 
 
+@pytest.mark.slow
 def test_a_twin_alone_waits_for_an_opc_ua_server_and_for_its_nodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

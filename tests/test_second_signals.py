@@ -298,6 +298,7 @@ def quickly(samples: Samples, steps: int, monkeypatch: pytest.MonkeyPatch) -> tu
     return fit_from_afar(samples, [start], told_of.append), told_of[-1]
 
 
+@pytest.mark.slow
 def test_a_second_pressure_narrows_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The ejector of another world: the chamber at the port and the hose are not the model's."""
     samples = with_signals(logged(LONG_LINE))

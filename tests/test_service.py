@@ -156,6 +156,7 @@ def running(manager: Manager, *arguments: str | Path) -> Iterator["subprocess.Po
             process.kill()
 
 
+@pytest.mark.slow
 def test_a_run_tells_it_beside_a_plc_and_while_it_waits_for_one(
     manager: Manager, plc: PlcProcess, tmp_path: Path
 ) -> None:

@@ -217,6 +217,7 @@ def test_air_saving_is_known_of_a_tank_that_holds() -> None:
     assert not read(silent).saves_air
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)  # a whole commissioning, on a computer that does other things beside
 def test_a_commissioning_goes_by_the_pressure_where_the_report_is_wrong() -> None:
     config = typed("gripper")

@@ -56,6 +56,7 @@ def reader(site: Path, browser: Browser) -> Iterator[Reader]:
     page.context.close()
 
 
+@pytest.mark.slow
 def test_every_page_is_there(site: Path) -> None:
     pages = {path.relative_to(rigs.ROOT / "docs") for path in (rigs.ROOT / "docs").rglob("*.md")}
     assert [page for page in pages if not (site / page).with_suffix(".html").exists()] == []
@@ -66,6 +67,7 @@ def test_every_notebook_is_in_the_gallery() -> None:
     assert notebooks == set(SHOWN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_was_run_and_shows_what_it_found(name: str, reader: Reader) -> None:
     reader.open(f"notebooks/{name}.html")

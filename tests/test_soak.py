@@ -61,6 +61,7 @@ def test_rows_go_on_for_ever(cycles: Samples) -> None:
     assert told == sorted(told)
 
 
+@pytest.mark.slow
 def test_two_minutes_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(soak, "LEAST_S", 0.001)
     fills = {"handles": 1e4, "threads": 1e4, "database_mb": 1e4}

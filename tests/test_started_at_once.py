@@ -79,6 +79,7 @@ def beside(plc: PlcProcess, log: Path, seconds: float) -> tuple[str | Path, ...]
     return "run", GRIPPER, "--address", address, "--log", log, "--duration", str(seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("then", "complaint"),
     [
@@ -176,6 +177,7 @@ def test_a_mistake_in_the_model_costs_no_row(
     assert told(log) == [Kind.NO_MODEL]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_cached")
 def test_rows_that_find_no_room_are_logged_without_the_model(
     plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -192,6 +194,7 @@ def test_rows_that_find_no_room_are_logged_without_the_model(
     assert told(log).count(Kind.NO_MODEL) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("then", ["", INTERRUPT])
 @pytest.mark.usefixtures("nothing_cached")
 def test_several_ejectors_wait_for_one_compiler(
@@ -249,6 +252,7 @@ def test_a_start_imports_nothing_that_it_does_not_need(
 # The compiler itself.
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_on_a_new_machine_the_first_row_is_there_at_once(
     plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

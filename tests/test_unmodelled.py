@@ -102,6 +102,7 @@ def test_weather_leaves_more_than_a_fault_and_comes_more_often() -> None:
     assert measured.of_cause(1, 0.0) < weather.of_cause(1, 0.0)  # it is followed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [830022, 830010])
 def test_a_mechanism_that_a_listed_cause_mimics_is_not_called_that_cause(seed: int) -> None:
     """Condensate, and a lip that lifts: a porous leak takes nearly all of either away."""

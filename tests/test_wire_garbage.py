@@ -159,6 +159,7 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpcuaPlc]:
         yield plc
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("protocol", ["modbus", "opcua"])
 def test_garbage_in_a_session(fresh: OpcuaPlc, protocol: str, seed: int) -> None:

@@ -121,6 +121,7 @@ def test_stored_sentences_of_these_pages_have_templates(
     assert len(texts) == count
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe")
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("code", ["en", "de"])
@@ -147,6 +148,7 @@ def test_axe_finds_no_violation_and_no_width_is_too_small(
             page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_each_picture_is_shown_once_with_letters_that_can_be_read(
     width: int, tmp_path: Path, browser: Browser

@@ -115,6 +115,7 @@ def seen(what: Locator, text: str | re.Pattern[str]) -> None:
 # --- the plant ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("second")
 def test_a_plc_boots_after_the_twin(cell: Cell, page: Page) -> None:
     cell.run.until(f"{BOOTS}: the PLC answers")
@@ -122,6 +123,7 @@ def test_a_plc_boots_after_the_twin(cell: Cell, page: Page) -> None:
     seen(light(page, BOOTS), RUNS)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("axe")
 def test_a_leak_is_found_on_the_screen_and_on_the_page(cell: Cell, page: Page) -> None:
     cell.run.until(f"{LEAKS} .*deviation_leakage")
@@ -139,6 +141,7 @@ def test_a_leak_is_found_on_the_screen_and_on_the_page(cell: Cell, page: Page) -
     assert violations(report) == []
 
 
+@pytest.mark.slow
 def test_an_alarm_is_acknowledged_on_a_phone(cell: Cell, browser: Browser, page: Page) -> None:
     phone = opened(cell, browser, **PHONE)
     leak_card(phone).get_by_role("link", name="Log in to acknowledge").tap()
@@ -179,6 +182,7 @@ def test_of_two_ejectors_one_goes_stale(cell: Cell, second: Program, page: Page)
 # --- at a desk ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_wrong_word_order_is_named_and_put_right(tmp_path: Path) -> None:
     config = write_cell(tmp_path, LEAKS, free_port())
     right = config.read_text()
@@ -207,6 +211,7 @@ blow_off = "Abblasen"
 """
 
 
+@pytest.mark.slow
 def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
     config = write_cell(tmp_path, LEAKS, free_port())
     book = Workbook()
@@ -240,6 +245,7 @@ READ_OFF = """
 """
 
 
+@pytest.mark.slow
 def test_an_unknown_rig_is_commissioned(tmp_path: Path) -> None:
     rows = rigs.recorded("test_rig", 60.0)[0][::2]
     trace = [
