@@ -464,6 +464,7 @@ def test_a_package_that_was_changed_is_refused(
         read_package(changed(path, part, old, new))
 
 
+@pytest.mark.slow
 def test_a_damaged_package_is_refused_or_whole(database: Assets, tmp_path: Path) -> None:
     whole = write_package(database.records(), time.time_ns(), {}, "")
     path, rng = tmp_path / "a.aasx", np.random.default_rng(5)

@@ -334,6 +334,7 @@ def test_a_summary_is_small_alone_and_harmless(kind: str, evil: dict[str, Any], 
     assert picture.startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_plot_is_a_figure_that_shows_itself(
     kind: str, evil: dict[str, Any], here: Path, tmp_path: Path

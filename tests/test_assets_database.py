@@ -254,6 +254,7 @@ def told(entries: list[Record], at: int, as_of: int | None) -> Record | None:
     return None
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(ENTRIES, QUESTIONS)
 def test_get_is_right_in_both_times(

@@ -17,6 +17,7 @@ IDLE, SUCTION, HOLD, BLOW_OFF = Phase
 PHASES = [(IDLE, 30), (SUCTION, 400), (HOLD, 90), (SUCTION, 60), (BLOW_OFF, 100), (IDLE, 120)]
 
 
+@pytest.mark.slow
 @pytest.mark.needs("cc")
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_the_benchs_c_gives_the_models_bits(

@@ -411,6 +411,7 @@ def test_an_interrupt_that_a_compiler_swallows_is_heeded(
         pair_of(rigs.config("gripper"))
 
 
+@pytest.mark.slow
 def test_a_kill_costs_half_a_second_at_most(plc: PlcProcess, tmp_path: Path) -> None:
     """Measured from the last row logged; a stall of the whole machine may spoil a try."""
     lost_s = []

@@ -105,6 +105,7 @@ def test_a_disk_that_is_full_is_said(
     assert "/dev/full: cannot be written: No space left" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_answer_alone_needs_nothing_that_draws_or_stores(log: Path) -> None:
     """Importing that would take longer than reading a short log."""
     code = (

@@ -120,6 +120,7 @@ def draw(rng: np.random.Generator, count: int, kind: str) -> Any:
     return rng.normal(size=count) if kind == "normal" else rng.exponential(size=count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["normal", "skewed"])
 @pytest.mark.parametrize("count", [5, 20])
 def test_intervals_hold_the_truth_as_often_as_they_say(count: int, kind: str) -> None:
@@ -164,6 +165,7 @@ def of_numbers(rng: np.random.Generator, count: int = 10, **shifts: float) -> Si
     return Side("a.mcap", header, "hash", list(range(count)), rows, nothing, nothing)
 
 
+@pytest.mark.slow
 def test_same_with_the_same_is_called_different_as_seldom_as_promised(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -312,6 +314,7 @@ def test_pictures_as_svg_are_the_same_every_time(
         assert words in text
 
 
+@pytest.mark.slow
 def test_the_recording_has_both_and_the_difference(sides: dict[str, Side], tmp_path: Path) -> None:
     chunk = pytest.importorskip("rerun.chunk")
     from twin.compare.recording import TIMELINE, record

@@ -42,12 +42,14 @@ class Planted:
         return Path.touch, (self.mark,)
 
 
+@pytest.mark.slow
 def test_a_start_with_all_compiled_gets_no_compiler_ready() -> None:
     for _ in range(2):  # the first one may have to compile it
         said = start()
     assert said.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_a_cache_that_others_may_write_to_is_not_unpickled(tmp_path: Path) -> None:
     cache, mark = tmp_path / "cache", tmp_path / "mark"
     assert "then kept" in start(cache).stderr

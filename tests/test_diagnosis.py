@@ -377,6 +377,7 @@ def test_what_no_mechanism_explains_gets_a_term_that_takes_it_away(
     assert answer["extended"]["rms_mbar"] < 0.5 * answer["baseline"]["rms_mbar"]
 
 
+@pytest.mark.slow
 def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -428,6 +429,7 @@ def test_fitted_and_held_out_cycles_have_nothing_in_common() -> None:
     assert {0} | set(cycles["fitted"]) | set(cycles["held_out"]) == set(range(cycles["total"]))
 
 
+@pytest.mark.slow
 def test_a_part_of_a_log_is_dated_from_the_logs_begin() -> None:
     """As beside a run, where only the last cycles are diagnosed."""
     whole = np.concatenate(list(record(27.0, "leakage=1.7@14.4", seed=21)))
@@ -670,6 +672,7 @@ def test_what_another_heat_exchange_leaves_for_the_next_cycle_is_counted() -> No
     assert {0, 3, 6} <= set(cause["cycles"])
 
 
+@pytest.mark.slow
 def test_where_the_likeliest_does_not_hold_the_search_begins_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -764,6 +767,7 @@ def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
     assert kept.effects == ("leakage",)
 
 
+@pytest.mark.slow
 def test_a_great_delay_does_not_look_like_a_small_one() -> None:
     log = recorded(GRIPPER_PLC, 7, 34, [parse_fault("blow_off_delay=31")])
     (cause,) = of(iter([log]), GRIPPER).json["causes"]
@@ -854,6 +858,7 @@ def test_a_saturated_sensor_is_insufficient() -> None:
     assert "saturated" in answer["next_experiment"]
 
 
+@pytest.mark.slow
 def test_a_gap_costs_its_cycle_and_nothing_else() -> None:
     def gappy() -> Iterator[Samples]:
         for number, block in enumerate(record(30.0, "leakage=2", seed=25)):

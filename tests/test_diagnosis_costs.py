@@ -61,6 +61,7 @@ def leak_of(name: str) -> dict[str, Any]:
     return cost(name, Cause("leakage", {"sonic_flow": LEAK}), 0.9 * LEAK, 1.1 * LEAK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_a_leak_costs_what_the_rig_takes_more(name: str) -> None:
     with_leak, without = (

@@ -87,6 +87,7 @@ def test_it_is_stored_as_a_unit_with_where_it_is_from(saved: Saved) -> None:
     assert received[0] < record.valid_from_ns < received[-1]  # the first cycle begins later
 
 
+@pytest.mark.slow
 def test_a_database_that_is_not_there_is_made_and_said(
     saved: Saved,
     tmp_path: Path,

@@ -40,6 +40,7 @@ def test_each_extra_is_described_and_all_has_all() -> None:
     assert everything.extras == {*EXTRAS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_a_module_is_asked_for_of_each_package(extra: str) -> None:
     distributions = packages_distributions()

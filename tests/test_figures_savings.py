@@ -171,6 +171,7 @@ def test_of_many_cycles_some_are_taken_evenly() -> None:
 # The command.
 
 
+@pytest.mark.slow
 def test_savings_are_told_with_how_sure_they_are(figures: Run, tmp_path: Path) -> None:
     out = figures("savings", logged(tmp_path / "run.mcap", PRICE), "--json", "s.json")
     head, now, *_ = out.splitlines()

@@ -208,6 +208,7 @@ def test_a_step_is_told_with_its_levels_its_time_and_how_sure_that_is(
     assert plain["days_to_limit"] is None
 
 
+@pytest.mark.slow
 def test_the_intervals_of_a_step_hold_what_they_promise() -> None:
     rng = np.random.default_rng(18)
     held = []

@@ -77,6 +77,7 @@ def test_each_log_is_worked_on_once(
     assert found["extended"] == before["A3-2.mcap"]["answer"]["extended"]
 
 
+@pytest.mark.slow
 def test_other_code_answers_anew(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,6 +121,7 @@ def test_a_broken_log_costs_only_itself(
     assert "Traceback" not in said.err
 
 
+@pytest.mark.slow
 def test_a_log_that_was_cut_off_is_said_to_be(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -183,6 +185,7 @@ def test_a_worker_with_other_code_is_refused(logs: Path) -> None:
     assert "another version" in done.error
 
 
+@pytest.mark.slow
 def test_a_worker_does_each_work_and_tells_what_stopped_it(logs: Path, tmp_path: Path) -> None:
     """In this process, whatever pools and clusters do with it."""
     replayed = here(Job("replay", logs / "A1-0.mcap", rigs.config("test_rig"), ""))
@@ -205,6 +208,7 @@ def at_a_loss(job: Job) -> Done:
     return run(job)
 
 
+@pytest.mark.slow
 def test_a_killed_process_costs_only_its_log(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

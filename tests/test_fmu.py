@@ -146,6 +146,7 @@ def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
     assert np.abs(mended - by_twin(rigs.theta("gripper"), commands)[1:]).max() < BOUND
 
 
+@pytest.mark.slow
 @pytest.mark.needs("cc")
 @pytest.mark.parametrize(
     ("mechanism", "values"),

@@ -34,7 +34,7 @@ from twin.events import Event, Kind
 from twin.figures.database import open_store
 from twin.figures.writer import Keeper
 from twin.live import Twin, run
-from twin.log.output import Output
+from twin.log.disk_file import Output
 from twin.log.part import SUFFIX
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
@@ -219,7 +219,7 @@ def fdatasync(_handle: int) -> None:
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.log.output.ThreadPoolExecutor", Inline)
+    monkeypatch.setattr("twin.log.disk_file.ThreadPoolExecutor", Inline)
     monkeypatch.setattr("os.fdatasync", fdatasync)
 
 

@@ -92,6 +92,7 @@ def read(begin: Callable[[], None], told: list[str]) -> Samples:
     return rows
 
 
+@pytest.mark.slow
 def test_whatever_network_call_of_the_driver_fails_no_row_is_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -147,6 +148,7 @@ def test_whatever_network_call_of_the_webhook_fails_no_alarm_is_lost(
 # --- e-mail -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_whatever_network_call_of_the_mails_fails_no_mail_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

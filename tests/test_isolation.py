@@ -106,6 +106,7 @@ def test_what_is_not_known_of_a_low_supply_is_nothing_unlisted(name: str) -> Non
     assert told[max(told)].get(UNKNOWN, 0.0) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "listed", "unlisted"),
     [
@@ -305,6 +306,7 @@ def test_a_change_that_begins_is_not_learned_as_usual() -> None:
     assert 20 <= first.data["cycle"] <= 25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "size"), [("test_rig", "leakage", 0.8), ("gripper", "suction_loss", 4.0)]
 )
@@ -317,6 +319,7 @@ def test_a_slow_drift_is_found_while_it_is_small(name: str, effect: str, size: f
     assert last[effect] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fault", "seed"),
     [

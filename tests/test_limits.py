@@ -202,6 +202,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(configured: UnitLimits) -
 # --- the database, and a restart ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_change_outlives_the_run_until_it_is_reset(
     url: str, monkeypatch: pytest.MonkeyPatch, configured: UnitLimits
 ) -> None:

@@ -369,7 +369,7 @@ def full_after(writes: int) -> Callable[[Any, bytes], None]:
 def test_a_full_disk_is_told_once_and_costs_no_flushed_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int
 ) -> None:
-    monkeypatch.setattr("twin.log.output.Output.write", full_after(writes))
+    monkeypatch.setattr("twin.log.disk_file.Output.write", full_after(writes))
     samples, ticks = course(10_000)
     with pytest.raises(SourceError, match=r"a\.mcap: cannot be written: No space left") as caught:
         record(tmp_path / "a.mcap", samples, ticks, block=250)
@@ -385,7 +385,7 @@ def test_after_a_failure_writing_says_so_again_and_closing_is_quiet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder(tmp_path / "a.mcap", HEADER)
-    monkeypatch.setattr("twin.log.output.Output.write", full_after(0))
+    monkeypatch.setattr("twin.log.disk_file.Output.write", full_after(0))
     for _ in range(2):
         with pytest.raises(SourceError, match="No space left"):
             recorder.write(*course(0), EVENTS)
@@ -397,7 +397,7 @@ def test_a_full_disk_at_the_very_end_is_told(
 ) -> None:
     recorder = Recorder(tmp_path / "a.mcap", HEADER, clock=Clock())
     recorder.write(*course(10))
-    monkeypatch.setattr("twin.log.output.Output.write", full_after(0))
+    monkeypatch.setattr("twin.log.disk_file.Output.write", full_after(0))
     with pytest.raises(SourceError, match="No space left"):
         recorder.close()
     recorder.close()

@@ -13,8 +13,8 @@ from log_rows import START_NS, awkward, course
 from mcap.reader import make_reader
 from mcap.writer import Writer as LibraryWriter
 
+from twin.log.disk_file import Output
 from twin.log.messages import Scalars
-from twin.log.output import Output
 from twin.log.schema import CHANNELS, SCALARS
 from twin.log.writer import CHUNK, Writer
 from twin.signals import SAMPLE, TICK

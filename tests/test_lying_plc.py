@@ -45,6 +45,7 @@ def lied_to(server: LyingServer, stream: Iterator[Samples]) -> Iterator[Samples]
     yield from islice(stream, BLOCKS // 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_lies_over_modbus_end_nothing_and_make_nothing_up(seed: int, tmp_path: Path) -> None:
     notices = Notices()

@@ -195,6 +195,7 @@ def test_what_nobody_listed_becomes_a_nozzle_that_gives_less_the_longer_it_runs(
     ].startswith("record ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [0.5, 2.0])
 def test_a_mechanism_holds_on_a_program_that_it_has_not_seen(times: float) -> None:
     """Most of what can be reached is: a curve of millibars would be carried to no other program."""

@@ -214,6 +214,7 @@ def test_what_is_told_does_not_depend_on_blocks(
 # Measurement and model.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("seed", [21, 22])
 def test_healthy_cycles_raise_no_alarm(name: str, seed: int) -> None:
@@ -272,6 +273,7 @@ def test_every_effect_is_among_the_hidden_ones() -> None:
     assert set(HIDDEN) == set(EFFECTS) - {"cup_compliance"}  # a fraction of an added volume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", HIDDEN)
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("seed", [31])

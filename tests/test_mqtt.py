@@ -143,6 +143,7 @@ def test_a_broker_that_lost_nothing_is_told_nothing_twice(tmp_path: Path, runnin
         assert [document.get("number") for document in listener.on(LEAK)] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_thousand_changes_wait_through_an_outage(tmp_path: Path, running: Broker) -> None:
     with Relay(running.port) as relay:
         bench = At(tmp_path / "a.sqlite", relay.port)
@@ -352,6 +353,7 @@ def test_a_run_tells_what_stands_and_what_happens(tmp_path: Path, running: Broke
     assert said == []
 
 
+@pytest.mark.slow
 def test_twin_run_tells_that_its_plc_has_gone(tmp_path: Path, running: Broker) -> None:
     tables = tomllib.loads(rigs.path_of("test_rig").read_text(encoding="utf-8"))
     tables["plc"]["program"]["commands"] = "coils"  # which nobody sets: it stays idle

@@ -48,6 +48,7 @@ def test_several_processes_say_together_what_is_left_out() -> None:
     assert f"{count[1]} skipped" in done.stdout
 
 
+@pytest.mark.slow
 def test_in_ci_a_missing_program_is_a_failure() -> None:
     done = run_without("cc", "tests/test_bench_kernel.py", ci="true")
     assert done.returncode == 1, done.stdout

@@ -101,6 +101,7 @@ def test_so_it_is_where_gas_convects_behind_a_check_valve() -> None:
     assert np.abs(expected - exact[:, kernel.SENSED]).max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_so_it_is_where_blow_off_drains_a_reservoir_and_closes_more_quickly(name: str) -> None:
     theta = between_samples(name, soft_and_late=False)

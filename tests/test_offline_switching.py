@@ -68,6 +68,7 @@ def times(found: list[Switching], on: bool) -> Floats:
 
 
 # Kinds that the old finder was lost on; seeds of the second world that no one designed with.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "kind"),
     [(7101, "closed_tank"), (7102, "micro"), (7103, "held_part"), (7101, "long_hose")],
@@ -79,6 +80,7 @@ def test_each_switching_of_a_foreign_rig_is_found_and_no_other(seed: int, kind: 
         assert not found.false
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "kind"), [(198144, "gripper"), (198322, "long_hose"), (198347, "held_part")]
 )

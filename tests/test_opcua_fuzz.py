@@ -53,6 +53,7 @@ acts = st.tuples(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(acts, min_size=1, max_size=5))
 def test_whatever_the_trace_holds_for_a_while_rows_are_true_or_bad(acts: list[Any]) -> None:

@@ -55,6 +55,7 @@ def refused(settings: OpcuaSettings, clock: Clock = REAL) -> SourceError | Confi
 # --- what comes ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_trace_comes_whole_and_is_the_one_that_modbus_serves(opcua: OpcuaPlc) -> None:
     document = Document.read(opcua.folder / "plc.toml")
     with closing(open_source(document, f"127.0.0.1:{opcua.port}")) as source:  # type: ignore[type-var]
@@ -269,6 +270,7 @@ def as_user(plc: OpcuaPlc, tmp_path: Path, password: str, **changes: Any) -> Opc
     return plc.settings(user=user, security=plc.secure("Basic256Sha256"), **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["secret", "gehaeuse-s3cret", "gehäuse-secret"])
 def test_a_wrong_password(awkward: OpcuaPlc, tmp_path: Path, wrong: str) -> None:
     error = refused(as_user(awkward, tmp_path, wrong))
@@ -306,6 +308,7 @@ def test_a_policy_that_is_not_offered(awkward: OpcuaPlc) -> None:
     assert error.hint.endswith("Basic256Sha256")
 
 
+@pytest.mark.slow
 def test_revised_intervals_and_dropped_connections(
     awkward: OpcuaPlc, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

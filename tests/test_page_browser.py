@@ -242,6 +242,7 @@ def test_a_comment_is_read_by_everybody(site: Site) -> None:
     expect(theirs.locator("#episodes .comment")).to_contain_text("new hose")
 
 
+@pytest.mark.slow
 def test_the_report_is_read_inside_the_page(site: Site) -> None:
     page = site.open()
     folder = folder_of(site.run.config.document, site.run.config.asset) / REPORTS
@@ -260,6 +261,7 @@ def test_the_report_is_read_inside_the_page(site: Site) -> None:
     expect(page.locator("#report")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_tabs_go_by_keyboard_and_what_is_new_is_told_to_who_listens(site: Site) -> None:
     page = site.open()
     site.until_light(page, "green")
@@ -319,6 +321,7 @@ def test_what_is_shelved_says_until_when_and_can_be_unshelved(site: Site) -> Non
     expect(card(page)).to_contain_text("unacknowledged")
 
 
+@pytest.mark.slow
 def test_without_login_there_is_nothing_to_press(site: Site) -> None:
     page = site.open()
     site.run.leak()
@@ -336,6 +339,7 @@ def test_without_login_there_is_nothing_to_press(site: Site) -> None:
     expect(deeds(page)).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_only_what_the_role_allows_can_be_pressed(site: Site, tmp_path: Path) -> None:
     users, page = quick_users(tmp_path / "users.toml"), site.open()
     site.run.leak()
@@ -478,6 +482,7 @@ def test_an_alarm_is_marked_where_it_was_raised(site: Site) -> None:
     assert at == pytest.approx(last, abs=0.2)
 
 
+@pytest.mark.slow
 def test_an_alarm_that_is_over_stays_marked_with_its_cause(site: Site) -> None:
     page = site.open()
     site.run.suck(2.0)
@@ -537,6 +542,7 @@ def test_a_peak_of_one_row_is_seen_among_thousands(site: Site) -> None:
     assert points <= 302
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1, 2, 3])
 def test_the_chart_fits_its_box_pixel_by_pixel_light_and_dark(site: Site, ratio: int) -> None:
     page = site.open(device_scale_factor=ratio, color_scheme="light")
@@ -667,6 +673,7 @@ def _kept_figures(site: Site, step: float = 0.0) -> None:
         store.add(Unit(asset.type, asset.id), "hash", "live", cycles)
 
 
+@pytest.mark.slow
 def test_history_is_searched(site: Site) -> None:
     page = site.open()
     site.run.leak()

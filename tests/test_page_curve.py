@@ -215,6 +215,7 @@ def test_what_is_kept_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert reader._kept_bytes < 100_000 or len(reader._kept) == 1
 
 
+@pytest.mark.slow
 def test_a_million_rows_answer_within_about_a_second(curves: Curves, tmp_path: Path) -> None:
     write_log(tmp_path / "run.mcap", rows(1000.0))
     read(curves, 0.0, 1.0)  # compiled once

@@ -173,6 +173,7 @@ def test_a_fresh_page_shows_the_whole_ring(site: Site) -> None:
     page.wait_for_function("() => live.rows.time.at(-1) - live.rows.time[0] > 58")
 
 
+@pytest.mark.slow
 def test_five_minutes_come_from_the_logs_where_the_browser_has_not_seen_them(logged: Site) -> None:
     page = logged.open()
     logged.run.suck(2.0)

@@ -448,6 +448,7 @@ def node(folder: Path) -> Iterator[int]:
         yield server.port
 
 
+@pytest.mark.slow
 def test_node_opcua_does_not_know_us(folder: Path, node: int, tmp_path: Path) -> None:
     certificates.make(tmp_path / "ours")
     opcua_plc.trust(tmp_path / "ours", folder / "theirs")

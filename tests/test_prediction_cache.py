@@ -265,6 +265,7 @@ def blocks(rows: Samples, ticks: Ticks, sizes: Iterator[int]) -> Iterator[tuple[
         begin = end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", rigs.NAMES)
 @pytest.mark.parametrize("most", [60, 1000, 9000])
 def test_what_is_used_again_does_not_depend_on_blocks(name: str, most: int) -> None:

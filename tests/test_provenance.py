@@ -226,6 +226,7 @@ def test_what_is_imported_is_declared_where_it_is_needed() -> None:
     ] == []
 
 
+@pytest.mark.slow
 def test_what_is_declared_is_imported() -> None:
     """A dependency that nothing imports would be installed for nothing."""
     providers = packages_distributions()

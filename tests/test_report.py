@@ -429,6 +429,7 @@ def test_without_a_cause_the_table_has_no_gain(pages: dict[str, str]) -> None:
     assert "what can be gained" not in page
 
 
+@pytest.mark.slow
 def test_all_text_is_escaped(tmp_path: Path) -> None:
     evil = "<script>alert('&')</script>"
     asset = {"type": evil, "id": '"' + evil}

@@ -304,6 +304,7 @@ def test_two_places_for_one_process_are_refused() -> None:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [None, "", "nonsense"])
 def test_users_that_cannot_be_used(tmp_path: Path, text: str | None) -> None:
     acquainted(tmp_path)
@@ -316,6 +317,7 @@ def test_users_that_cannot_be_used(tmp_path: Path, text: str | None) -> None:
     assert "twin users add" in refused.value.hint
 
 
+@pytest.mark.slow
 def test_what_hinders_a_login_is_said_by_the_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -467,6 +469,7 @@ def test_nobody_can_write_or_change_anything(server: ResultsServer, rig: Results
     asyncio.run(attempt())
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_told(server: ResultsServer) -> None:
     port = int(server.url.rpartition(":")[2])
     taken = HERE.model_copy(update={"port": port})
@@ -488,6 +491,7 @@ def by_node(server: ResultsServer, folder: Path, **options: Any) -> dict[str, An
     return answer
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_node_opcua_reads_and_subscribes_and_cannot_write(
     server: ResultsServer, rig: Results, tmp_path: Path
@@ -540,6 +544,7 @@ class beating:  # noqa: N801 - it reads as a function
         self._thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_a_client_that_hangs_holds_up_nobody(
     server: ResultsServer, rig: Results, tmp_path: Path
@@ -589,6 +594,7 @@ def test_node_opcua_comes_in_protected(tmp_path: Path, policy: str) -> None:
 # --- beside a PLC -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_beside_a_plc_the_results_follow(server: ResultsServer) -> None:
     document = Document.read(rigs.path_of("test_rig"))
     sink = server.sink("live", "compact-ejector-35")

@@ -150,6 +150,7 @@ def states(one: dict[str, Any]) -> tuple[bool, bool, bool]:
     return one["ActiveState.Id"], one["AckedState.Id"], one["Retain"]
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_figures_and_the_plc_have_their_own_kinds(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("kinds", ""), Stream()
@@ -168,6 +169,7 @@ def test_figures_and_the_plc_have_their_own_kinds(server: ResultsServer, tmp_pat
     assert leak["SuppressedOrShelved"]  # while the PLC is stale
 
 
+@pytest.mark.slow
 @pytest.mark.needs("node-opcua")
 def test_a_renamed_alarm_goes_on_under_its_new_name(server: ResultsServer, tmp_path: Path) -> None:
     sink, stream = server.sink("named", ""), Stream()

@@ -330,6 +330,7 @@ def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
     assert alike.mean() < 0.5  # each has the noise of its own rig
 
 
+@pytest.mark.slow
 def test_one_that_cannot_begin_leaves_the_others_and_is_exit_code_3(
     plc: PlcProcess,
     tmp_path: Path,
@@ -432,6 +433,7 @@ def said_of(stream: IO[str], what: str, times: int) -> list[str]:
     return list(itertools.islice((line for line in stream if what in line), times))
 
 
+@pytest.mark.slow
 def test_several_ejectors_are_viewed_in_one_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -313,6 +313,7 @@ def test_a_second_pressure_narrows_the_line(monkeypatch: pytest.MonkeyPatch) -> 
     assert low < logged(LONG_LINE).truth.rig.ejector.head_volume / ML < high
 
 
+@pytest.mark.slow
 def test_it_is_left_out_where_the_first_would_be_followed_less_well(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -515,6 +515,7 @@ def test_drawn_rigs_are_of_the_sizes_on_the_market(seed):
     assert vessel.leak <= 0.012 * rig.nominal_flow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(24))
 def test_drawn_rigs_are_healthy_over_whole_records(seed):
     """Every kind at least twice. The first cycle starts with cold air, the others are alike."""

@@ -34,6 +34,7 @@ from twin.page.ring import read
 from twin.page.settings import RING, folder_of
 
 
+@pytest.mark.slow
 def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     path = write_config(tmp_path)
     Run(config(path)).close()
@@ -50,6 +51,7 @@ def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
         server.stdout.close()
 
 
+@pytest.mark.slow
 def test_it_serves_over_tls(tmp_path: Path) -> None:
     path = write_config(tmp_path)
     Run(config(path)).close()

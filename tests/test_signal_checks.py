@@ -239,6 +239,7 @@ def test_a_calibration_refuses_what_contradicts() -> None:
     assert "leave the tag out" in str(error.value.hint)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_tells_it_beside_its_answer() -> None:
     diagnosis = diagnose(
         rigs.config("test_rig"), [changed(simulated("test_rig"), reversed_flow)], "log", quiet

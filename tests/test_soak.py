@@ -48,6 +48,7 @@ def cycles() -> Samples:
     return soak.stretch(rigs.config("test_rig").document.section(PlcSettings, "plc"))
 
 
+@pytest.mark.slow
 def test_rows_go_on_for_ever(cycles: Samples) -> None:
     told: list[float] = []
     blocks = soak.endless(cycles, told.append)

@@ -68,6 +68,7 @@ def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[Heard]) 
         assert [names[i] for i in np.flatnonzero(~shown)] == ["h2_shift"]
 
 
+@pytest.mark.slow
 def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[Heard]) -> None:
     old = listener()
     for cycle in heard * 2:

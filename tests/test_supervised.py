@@ -356,7 +356,7 @@ class Disk:
             found.free = 0 if self.full else free
             return found
 
-        monkeypatch.setattr("twin.log.output.Output.write", write)
+        monkeypatch.setattr("twin.log.disk_file.Output.write", write)
         monkeypatch.setattr("twin.log.recorder.shutil.disk_usage", usage)
 
 

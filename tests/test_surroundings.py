@@ -104,6 +104,7 @@ def test_a_diagnosis_goes_by_the_day_of_its_log(name: str) -> None:
     assert followed < 0.5 * unseen
 
 
+@pytest.mark.slow
 def test_a_log_of_another_day_is_consistent() -> None:
     found = diagnose(rigs.config("test_rig"), [another_day("test_rig")], "log.mcap", lambda _: None)
     assert found.json["verdict"] == "consistent"
@@ -149,6 +150,7 @@ def test_rows_that_repeat_a_reading_are_recognised(name: str, renewed: int) -> N
     assert sensor.noise_in_means(10.0) == sensor.noise_mbar
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "renewed_ms"), [(198205, 2.0), (198215, 5.0), (198203, 0.0)])
 def test_on_rigs_of_another_world_it_is_found_as_well(seed: int, renewed_ms: float) -> None:
     samples = samples_of(record(draw_rig(seed), seed, 6))

@@ -50,6 +50,7 @@ _LINES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     st.lists(_LINES, max_size=12),
@@ -102,6 +103,7 @@ def _samples(rows: list[tuple[float, ...]], start: int) -> Samples:
     return samples
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(ROWS, st.sampled_from([0, -(10**18), 1_767_225_600_000_000_000, 2**63 - 2**50]))
 def test_any_valid_rows_come_back_to_the_bit(rows: list[tuple[float, ...]], start: int) -> None:

@@ -117,6 +117,7 @@ def not_seen(data: DataSet, samples: Samples, acts: tuple[tuple[int, bool], ...]
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_threshold_is_where_the_control_decided_and_not_where_the_pressure_turns(
     seed: int,
@@ -130,6 +131,7 @@ def test_the_threshold_is_where_the_control_decided_and_not_where_the_pressure_t
     assert low == pytest.approx(true_low, abs=4.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_nozzle_that_closes_slowly_is_seen_while_the_twin_runs(seed: int) -> None:
     data, samples, acts = recorded(seed)
@@ -138,6 +140,7 @@ def test_a_nozzle_that_closes_slowly_is_seen_while_the_twin_runs(seed: int) -> N
     assert not_seen(as_commissioned(data, samples), samples, acts) == 0
 
 
+@pytest.mark.slow
 def test_a_commissioned_unit_has_these_thresholds(monkeypatch: pytest.MonkeyPatch) -> None:
     data, samples, _ = recorded(0)
 

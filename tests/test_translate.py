@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from twin.exchange.c import INDEX, LANE, NUMBER, ROWS, WHOLE, Untranslatable
+from twin.exchange.c_expressions import INDEX, LANE, NUMBER, ROWS, WHOLE, Untranslatable
 from twin.exchange.translate import Program
 
 LOW, _STEEP = 2, 0.1

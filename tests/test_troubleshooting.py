@@ -60,6 +60,7 @@ def pattern(quote: str) -> str:
     return r"[^\n]*?".join(re.escape(part) for part in quote.split("…"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quote", quotes())
 def test_the_program_says_what_is_quoted(quote: str) -> None:
     assert re.search(pattern(quote), texts()), quote

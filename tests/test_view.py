@@ -280,6 +280,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Screen, psutil.Proce
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the viewer opens a window")
 class TestLive:
+    @pytest.mark.slow
     def test_listens_on_loopback_only_and_ends_with_the_view(
         self, live: tuple[Screen, psutil.Process]
     ) -> None:

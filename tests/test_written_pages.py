@@ -52,6 +52,7 @@ def without_lines(text: str) -> str:
     return re.sub(r"\b(ejector|system|sensor)\.\w+", "", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["good", "usable", "refused", "fleet"])
 def test_a_german_page_is_german_in_each_word_and_number(name: str, tmp_path: Path) -> None:
     page = page_of(name, "de", tmp_path).read_text(encoding="utf-8")
@@ -210,6 +211,7 @@ def test_lines_and_letters_of_pictures_stand_out_in_both_schemes(browser: Browse
                 assert contrast(pixel, ground) >= least, (colour, scheme)
 
 
+@pytest.mark.slow
 def test_paper_is_white_and_wide(tmp_path: Path, browser: Browser) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark")
     page.goto(page_of("report", "en", tmp_path).as_uri())

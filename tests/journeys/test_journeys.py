@@ -155,6 +155,7 @@ def test_an_alarm_is_acknowledged_on_a_phone(cell: Cell, browser: Browser, page:
     cell.run.until(f"{LEAKS} .*deviation_leakage acknowledged by ann")
 
 
+@pytest.mark.slow
 def test_a_german_browser_shows_a_german_page(cell: Cell, browser: Browser, page: Page) -> None:
     german = opened(cell, browser, locale="de-DE")
     seen(leak_card(german), "Leckage")
@@ -165,6 +166,7 @@ def test_a_german_browser_shows_a_german_page(cell: Cell, browser: Browser, page
     seen(leak_card(page), "Leakage")  # every browser has its own language
 
 
+@pytest.mark.slow
 def test_of_two_ejectors_one_goes_stale(cell: Cell, second: Program, page: Page) -> None:
     """It is the last one here: it ends what the others share."""
     seen(light(page, BOOTS), RUNS)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from uuid import NAMESPACE_URL, uuid5
 
-from twin.exchange.c import INDEX, LANE, NUMBER, ROWS, TABLES, WHOLE, literal
+from twin.exchange.c_expressions import INDEX, LANE, NUMBER, ROWS, TABLES, WHOLE, literal
 from twin.exchange.translate import Program
 from twin.exchange.variables import Component, Role, Variable, reference
 from twin.model import control, kernel, plant

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.exchange.c import (
+from twin.exchange.c_expressions import (
     ATOM,
     INDEX,
     LANE,

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from twin.errors import ConfigError
+from twin.log.disk_file import Output
 from twin.log.header import Identity, LogHeader, to_metadata
-from twin.log.output import Output
 from twin.log.schema import CHANNELS, LIBRARY
 from twin.log.writer import Writer
 

@@ -15,9 +15,9 @@ import numpy as np
 from twin.errors import SourceError, in_words
 from twin.events import Event, Kind
 from twin.log.columns import encode, joined
+from twin.log.disk_file import Output
 from twin.log.header import Identity, LogHeader
 from twin.log.messages import Scalars, encode_event, encode_log
-from twin.log.output import Output
 from twin.log.part import CLOCK_METADATA, part_path, write_head
 from twin.log.schema import CHANNELS
 from twin.signals import SAMPLE, TICK, Samples, Ticks

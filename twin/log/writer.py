@@ -32,7 +32,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from twin.log.output import Output
+from twin.log.disk_file import Output
 
 CHUNK = 1 << 20  # bytes; a chunk that has grown longer is completed
 

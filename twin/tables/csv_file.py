@@ -18,9 +18,9 @@ from pyarrow import csv as arrow_csv
 
 from twin.errors import SourceError
 from twin.tables import scope
-from twin.tables.decode import Batch
 from twin.tables.layout import wanted_names
 from twin.tables.settings import Column, Encoding, ImportSettings
+from twin.tables.table_to_samples import Batch
 
 _PIECE = 1 << 19  # characters, about 10 000 rows
 _LOOK = 1 << 19  # bytes that decide the encoding

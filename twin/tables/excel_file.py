@@ -14,9 +14,9 @@ from openpyxl import load_workbook
 
 from twin.errors import SourceError, known_names
 from twin.files import unzipped_within_budget
-from twin.tables.decode import Batch
 from twin.tables.layout import wanted_names
 from twin.tables.settings import Column, ImportSettings
+from twin.tables.table_to_samples import Batch
 
 _ROWS = 10_000
 _PREAMBLE = 200  # rows that may stand before the header

@@ -9,10 +9,10 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from twin.errors import SourceError
-from twin.tables.decode import Batch
 from twin.tables.numbers import is_readable
 from twin.tables.parquet_pages import require_small_pages
 from twin.tables.settings import Column, ImportSettings
+from twin.tables.table_to_samples import Batch
 
 _ROWS = 10_000
 _BUFFER = 1 << 20  # bytes read ahead of each column, instead of a whole row group

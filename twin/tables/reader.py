@@ -13,13 +13,13 @@ from twin.files import MEMORY_BUDGET, require_within_budget
 from twin.signals import SAMPLE, Samples, joined
 from twin.tables.csv_file import CsvFile
 from twin.tables.date_time import Calendar
-from twin.tables.decode import Batch
 from twin.tables.derive import Derived, derive
 from twin.tables.excel_file import ExcelFile
 from twin.tables.intake import Intake
 from twin.tables.layout import COMMANDS, Layout, find_layout
 from twin.tables.parquet_file import ParquetFile
 from twin.tables.settings import Column, ImportSettings
+from twin.tables.table_to_samples import Batch
 from twin.tables.unit_check import UnitCheck
 
 Bits = npt.NDArray[np.uint8]
