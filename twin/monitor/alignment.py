@@ -23,6 +23,7 @@ CLEAR = 5.0  # sigmas of a reading
 # Share of the squares. On 35 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
 # pressure places breaks better, and 0.46 or more where the breaks place themselves.
 MUCH_MORE_ALIKE = 0.25
+FINE_ROWS = 30  # least rows of such a course: a hose rings in some 20 ms
 ELSEWHERE = 3.0  # rms over noise, from which the course about a knee is another than the usual one
 ROUNDS, NARROWS = 4, 0.7
 OF_NOISE = 40.0  # variance factor of the time, as in ``breakpoints``, with the common shape known
@@ -83,18 +84,21 @@ def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
     A line that rings after the nozzle has closed breaks the slope again and again: some knees may
     be at another of these breaks than most. Levels and slopes of the courses do not count. If most
     are at a later break, all move to the first one: to where the fall ends for the first time.
-    Knees that come sooner after one another than such a course lasts stay where they are.
+    Knees that come sooner after one another than such a course lasts stay where they are. So do all
+    in rows too far apart to show a line ring.
     """
     times = np.array([knee.time for knee in knees])
     rows = np.array([knee.rows for knee in knees], np.int64).reshape(-1, 2)
     limits = course.time[rows - [0, 1]]
     has_room = (times - AROUND > limits[:, 0]) & (times + AROUND < limits[:, 1])
-    if np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(knees)):
+    is_fine = FINE_ROWS * course.period < 2.0 * AROUND
+    if not is_fine or np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(knees)):
         return
     about = _Bent(course)
     usual = np.median(about.at(times[has_room]), axis=0)
     shifts = np.arange(-FARTHEST, FARTHEST + 0.5 * course.period, course.period)
-    for number, (first, last) in enumerate(limits):
+    for number in np.flatnonzero(has_room):
+        first, last = limits[number]
         at = times[number] + shifts
         at = np.append(times[number], at[(at - AROUND > first) & (at + AROUND < last)])
         squares = np.mean((about.at(at) - usual) ** 2, axis=1)
