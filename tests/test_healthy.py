@@ -10,6 +10,7 @@ from second_rigs import config_of, samples_of
 from second_world.draw import draw_rig
 from second_world.records import record
 
+from twin.calibration.calibrate import rounding
 from twin.calibration.commission import commission
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
@@ -46,6 +47,9 @@ def test_what_is_left_shrinks_by_what_healthy_cycles_show_but_noise_does_not() -
 
     assert scaled(0.5) == pytest.approx(0.25 * (scaled(1.0) - noise) + noise)
     assert scaled(2.0) == pytest.approx(4.0 * scaled(1.0))
+    coarse = Reading(0.3, rounding=0.2)
+    rounded = from_cycle_to_cycle(bins, rows, persistent, moves, coarse, 0.5)
+    assert rounded - scaled(0.5) == pytest.approx(0.2**2)  # all readings are off alike
 
 
 def _of_contact(jitter_ms: float, seed: int) -> Evidence:
@@ -140,6 +144,15 @@ def test_rounding_leaves_an_error_that_no_number_of_readings_takes_away(noise: f
     chance = noise / np.sqrt(5000)
     assert rounding_error(1.0, of_all) == pytest.approx(errors, rel=0.35, abs=2.0 * chance)
     assert converter_step(np.repeat(np.arange(30.0), 3)) == 1.0
+
+
+def test_repeated_readings_are_as_coarse_as_others() -> None:
+    data, samples = rigs.config("gripper").data, rigs.recorded("gripper", 6.0)[0].copy()
+    samples["pressure"] = np.round(samples["pressure"] / MBAR) * MBAR
+    for renewed_ms in (0.0, 5.0):
+        sensor = data.sensor.model_copy(update={"noise_mbar": 0.29, "renewed_ms": renewed_ms})
+        left = rounding(data.model_copy(update={"sensor": sensor}), samples)
+        assert left == pytest.approx(0.285, abs=0.01)
 
 
 def test_readings_without_steps_have_no_rounding_error() -> None:

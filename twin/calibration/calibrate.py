@@ -20,6 +20,7 @@ from twin.figures.cycle import KeyFigures
 from twin.figures.settings import LIMITED
 from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
+from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.detector_window import as_wide_as_needed
 from twin.monitor.healthy import Healthy, Scatter, sure
@@ -198,10 +199,21 @@ def like_these(
     untold: Mapping[str, float] = NOTHING,
 ) -> Healthy:
     """Healthy deviations from the calibrated twin; ``untold`` as in ``uncertain``."""
-    model_scatter = Healthy(figures=figures, uncertain=uncertain(fitted, untold))
+    model_scatter = Healthy(
+        figures=figures,
+        uncertain=uncertain(fitted, untold),
+        rounding_mbar=rounding(fitted.data, samples),
+    )
     monitor = config.monitor.model_copy(update={"healthy": model_scatter})
     healthy = learned(collect(replace(config, data=fitted.data, monitor=monitor), [samples]))
     return healthy.model_copy(update={"key_figures": limited(fitted.data, samples)})
+
+
+def rounding(data: DataSet, samples: Samples) -> float:
+    """What rounding leaves (mbar, one sigma) in a mean of the readings of one pressure."""
+    usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
+    step = converter_step(samples["pressure"][usable].astype(np.float64)) / MBAR
+    return round(rounding_error(step, data.sensor.noise_mbar), 4)
 
 
 def limited(data: DataSet, samples: Samples) -> dict[str, Scatter]:

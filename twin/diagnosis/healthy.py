@@ -16,10 +16,9 @@ from twin.diagnosis.residual_covariance import (
 )
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
-from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.healthy import MEETS_MS, Healthy, ModelError
 from twin.monitor.scatter_covariance import FIRST_ERROR, SCATTER
-from twin.signals import MBAR, MS
+from twin.signals import MS
 
 ROUNDS = 3
 FEWEST = 6  # cycles, to learn from one half and judge on the other
@@ -57,9 +56,7 @@ class _HealthyDeviation:
 
 def learned(evidence: Evidence) -> Healthy:
     """``evidence.healthy`` with the model's error and the scatter learned from its cycles."""
-    unlearned = evidence.healthy.model_copy(
-        update={"meets_ms": MEETS_MS, "rounding_mbar": _rounding(evidence)}
-    )
+    unlearned = evidence.healthy.model_copy(update={"meets_ms": MEETS_MS})
     evidence = replace(evidence, another_day=False, healthy=unlearned)
     uncertain = [(shift.up, shift.down) for shift in evidence.uncertain]
     off, moves, opened = moved(evidence, HEALTHY, SCATTER, uncertain)
@@ -75,12 +72,6 @@ def learned(evidence: Evidence) -> Healthy:
     return _learned(deviation, judged).model_copy(
         update={"leftover": usual_leftover(np.concatenate(chi2))}
     )
-
-
-def _rounding(evidence: Evidence) -> float:
-    """What rounding leaves (mbar) in a mean of readings of one pressure, less than a step apart."""
-    used = evidence.samples["pressure"][evidence.bins.number >= 0].astype(np.float64)
-    return rounding_error(converter_step(used) / MBAR, evidence.noise)
 
 
 def _chi2_by_cycle(deviation: _HealthyDeviation, healthy: Healthy, cycles: Sequence[int]) -> Floats:

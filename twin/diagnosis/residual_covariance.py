@@ -108,14 +108,16 @@ class Covariance:
             ]
 
         variance = np.concatenate([np.empty(0), *map(np.diag, by_cycle(1.0))])
-        rounding = np.full(len(rows), evidence.healthy.rounding_mbar)
-        variance += np.sum([error**2 for error in (common, rounding, *mismatches)], axis=0)
+        rounding = evidence.healthy.rounding_mbar
+        in_common = (np.hypot(common, rounding), *mismatches)
+        variance += np.sum([error**2 for error in in_common], axis=0)
         usual = _row_rms(variance, bins.count[rows], evidence.noise)
         is_unseen = unsure**2 > UNSEEN**2 * variance[:, None]
         is_unseen[:, self.beyond.shape[1] :] |= self.of_weather
         unmeasured = _row_rms(np.sum(unsure**2 * is_unseen, axis=1), bins.count[rows], 0.0)
         groups = by_cycle(learned)
-        moves, prior = _in_common(bins, rows, [learned * common, rounding, *mismatches], unsure)
+        common = np.hypot(learned * common, rounding)
+        moves, prior = _in_common(bins, rows, [common, *mismatches], unsure)
         sigma = _level_sigmas(evidence, cycles)
         if len(sigma):  # no unknown of the bins moves the levels
             groups.append(np.diag(sigma**2) + _common_levels(evidence, cycles))

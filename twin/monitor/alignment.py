@@ -94,14 +94,13 @@ def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
     is_fine = FINE_ROWS * course.period < 2.0 * AROUND
     if not is_fine or np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(knees)):
         return
-    about = _Bent(course)
-    usual = np.median(about.at(times[has_room]), axis=0)
+    usual = np.median(_bent(course, times[has_room]), axis=0)
     shifts = np.arange(-FARTHEST, FARTHEST + 0.5 * course.period, course.period)
     for number in np.flatnonzero(has_room):
         first, last = limits[number]
         at = times[number] + shifts
         at = np.append(times[number], at[(at - AROUND > first) & (at + AROUND < last)])
-        squares = np.mean((about.at(at) - usual) ** 2, axis=1)
+        squares = np.mean((_bent(course, at) - usual) ** 2, axis=1)
         best = int(squares.argmin())
         is_off = squares[0] > (ELSEWHERE * course.noise.single) ** 2
         if is_off and squares[best] < MUCH_MORE_ALIKE * squares[0]:
@@ -111,19 +110,13 @@ def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
         knee.time = time
 
 
-@dataclass(frozen=True)
-class _Bent:
-    """Courses about times, each without its own line."""
-
-    course: Course
-
-    def at(self, times: Floats) -> Floats:
-        """What remains of them (Pa), (times, rows)."""
-        offsets = np.arange(-AROUND, AROUND, self.course.period)
-        straight = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(offsets)), 2))[0]
-        values = np.interp(times[:, None] + offsets, self.course.time, self.course.pressure)
-        without_line: Floats = values - (values @ straight) @ straight.T
-        return without_line
+def _bent(course: Course, times: Floats) -> Floats:
+    """The course (Pa) about times, each part without its own line, (times, rows)."""
+    offsets = np.arange(-AROUND, AROUND, course.period)
+    straight = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(offsets)), 2))[0]
+    values = np.interp(times[:, None] + offsets, course.time, course.pressure)
+    without_line: Floats = values - (values @ straight) @ straight.T
+    return without_line
 
 
 def _first_end_of_fall(course: Course, times: Floats) -> float:
