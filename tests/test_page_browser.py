@@ -214,7 +214,7 @@ def test_it_opens_on_what_is_worst_and_lists_all_alarms_worst_first(site: Site) 
     assert [light.get_attribute("data-number") for light in lights.all()] == ["2", "1", "0"]
     expect(lights.first).to_have_attribute("aria-pressed", "true")
     expect(page.locator("#measured")).to_have_text("300")
-    expect(page).to_have_title("Alarm – gripper-03")
+    site.until(page, lambda: page.title() == "Alarm – gripper-03")
     cards.nth(1).get_by_role("button", name="Show its curve").click()
     expect(page.locator("#measured")).to_have_text("500")
     expect(page.locator("#plot-head")).to_contain_text("gripper-02")
