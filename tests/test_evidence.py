@@ -10,10 +10,13 @@ import rigs
 
 from twin.diagnosis.evidence import HEALTHY, collect, read_cycles, thinned
 from twin.diagnosis.residual_covariance import covariance
+from twin.live import Twin
 from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.monitor.cycles import whole
+from twin.monitor.detector_window import knees_of
+from twin.monitor.smoothed_nozzle import smoothed
 from twin.signals import Phase, Samples
 
 SECONDS = 60.0
@@ -82,11 +85,19 @@ def test_a_valve_can_act_before_its_command_is_seen() -> None:
 
 
 class Reread:
-    """Blocks of a log that are made anew by each iteration, as those of a file are."""
+    """Blocks of a log, ``again`` times, made anew by each iteration, as those of a file are."""
+
+    def __init__(self, again: int = 1) -> None:
+        self.again = again
 
     def __iter__(self) -> Iterator[Samples]:
         samples, _ = rigs.recorded("test_rig", SECONDS)
-        return (block.copy() for block in rigs.cut(samples, 1000))
+        for number in range(self.again):
+            for block in rigs.cut(samples, 1000):
+                later = block.copy()
+                later["sequence"] += number * len(samples)
+                later["time_ns"] += number * (samples["time_ns"][-1] - samples["time_ns"][0])
+                yield later
 
 
 @pytest.mark.parametrize("piece", [100_000, 700])
@@ -94,9 +105,10 @@ def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit(
     piece: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("twin.diagnosis.evidence.PIECE", piece)
-    log = read_cycles(rigs.config("test_rig"), Reread())
-    twin = rigs.twin("test_rig")
-    cycles = whole(twin.over(Reread()))
+    config = rigs.config("test_rig")
+    log, theta = read_cycles(config, Reread()), coefficients(config.data)
+    settings = smoothed(theta, knees_of(config.data), Reread())
+    cycles = whole(Twin(theta, settings[0], config.data.terms, settings[1]).over(Reread()))
     assert log.cycles == len(cycles) > 15
     for number, cycle in enumerate(cycles):
         for kept, given in zip(log.rows(number), (cycle.samples, cycle.ticks), strict=True):
@@ -106,15 +118,18 @@ def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit(
     assert log.saturated == 0.0
 
 
-def test_reading_a_log_takes_no_memory_for_all_its_rows() -> None:
-    """Rows of one cycle and of some blocks at a time, in several passes."""
+def test_reading_a_log_takes_no_memory_for_all_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of a piece, of one cycle and of some blocks at a time, in several passes."""
+    monkeypatch.setattr("twin.monitor.smoothed_nozzle.PIECE", 2_000)
     read_cycles(rigs.config("test_rig"), Reread())  # compiles first
+    most = []
+    for again in (1, 3):
+        tracemalloc.start()
+        read_cycles(rigs.config("test_rig"), Reread(again))
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
     samples, _ = rigs.recorded("test_rig", SECONDS)
-    tracemalloc.start()
-    read_cycles(rigs.config("test_rig"), Reread())
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < samples.nbytes
+    assert most[1] - most[0] < samples.nbytes  # of twice as many more rows
 
 
 def test_evidence_of_some_cycles_is_that_of_all_cut_down() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from twin.events import Event, Kind
 from twin.model import dense_solver as strides
@@ -56,17 +57,21 @@ class EventEnricher(Protocol):
 
 @dataclass
 class Twin:
-    """The model that runs beside the rig; it expects the sensor's reading with a short delay."""
+    """The model that runs beside the rig; it expects the sensor's reading with a short delay.
+
+    ``nozzle`` is what a whole log shows of it, as for ``PhaseFinder``.
+    """
 
     theta: Theta
     knees: Knees
     terms: Sequence[Term] = ()
+    nozzle: npt.NDArray[np.uint8] | None = None
     _solver: DenseSolver = field(default_factory=DenseSolver)
     _steps: TimeSteps = field(default_factory=TimeSteps)
     _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
-        self._finder = PhaseFinder(self.knees)
+        self._finder = PhaseFinder(self.knees, self.nozzle)
         self._surrounded_theta = self.theta  # coefficients with the measured surroundings
         self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
 

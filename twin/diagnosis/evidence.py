@@ -33,11 +33,12 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
-from twin.monitor.detector_window import as_wide_as_needed, knees_of
+from twin.monitor.detector_window import knees_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import least_time_ms
 from twin.monitor.simulated_switching import Seen, seen
+from twin.monitor.smoothed_nozzle import smoothed
 from twin.monitor.surroundings import medians_of, surrounded
 from twin.monitor.switching_detector import Knees
 from twin.monitor.uncertain_data import Shift, shifted
@@ -545,6 +546,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
     """The complete cycles of a log for the twin of ``base``, in the log's surroundings."""
     medians = medians_of(blocks)
     theta = surrounded(base.theta, medians)
+    knees, nozzle = smoothed(theta, base.knees, _Bridged(blocks))
     base = replace(
         base,
         theta=theta,
@@ -553,13 +555,13 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
             for up, down, tied in base.uncertain
         ),
         told=frozenset(medians),
-        knees=as_wide_as_needed(base.knees, _Bridged(blocks)),
+        knees=knees,
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
         _seen={},  # depends on the settings of the finder
     )
     begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
-    twin = Twin(base.theta, base.knees, base.terms)
+    twin = Twin(base.theta, base.knees, base.terms, nozzle)
     for cycle in cut(twin.over(_Bridged(blocks)), math.inf):
         if not cycle.complete:
             continue

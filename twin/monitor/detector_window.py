@@ -46,17 +46,14 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
     sensor leaves 1 / (1 + lag / n) of that difference. Without air saving there are only the
     breakpoints that the ejector reports.
     """
-    h1 = theta[c.AMBIENT] - theta[c.H1]
-    suction = suction_at(theta, h1) * R * theta[c.TEMPERATURE]
-    bend = max(
-        GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period, 1e-3
-    )  # Pa per row
+    bend = _bend(theta, period)
     sharp = rows = (24.0 * (SHARP * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
     lag = math.hypot(theta[c.SENSOR_LAG], theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / period
     for _ in range(ROUNDS):
         rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
     window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
-    to_the_end = (h1 - theta[c.END_RATIO] * theta[c.AMBIENT]) / bend  # at this slope
+    above_the_end = theta[c.AMBIENT] - theta[c.H1] - theta[c.END_RATIO] * theta[c.AMBIENT]
+    to_the_end = above_the_end / bend  # at this slope
     at_once = Knees(
         window=window,
         longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
@@ -72,22 +69,37 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
         acts=(round(theta[c.RESPONSE_OFF] / period), round(theta[c.RESPONSE] / period)),
         period=period,
     )
-    return _as_in_free_run(at_once, theta, GAMMA * theta[c.H1] / bend)
+    return _as_in_free_run(at_once, theta)
 
 
-def _as_in_free_run(knees: Knees, theta: Theta, rows_to_h1: float) -> Knees:
-    """``knees`` with delays and distance as in a free run, which reaches H1 by ``rows_to_h1``.
+def _bend(theta: Theta, period: float) -> float:
+    """Change of the slope (Pa per row) as the nozzle goes off at H1."""
+    suction = suction_at(theta, theta[c.AMBIENT] - theta[c.H1]) * R * theta[c.TEMPERATURE]
+    return float(max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period, 1e-3))
 
-    Jet and sensor delay a breakpoint; the step at the port advances it. While that step oscillates
-    in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
-    does not show how high, the window covers the oscillation, over which it averages out. A second
-    run has a flow back, so that the vacuum falls to where the nozzle goes on.
+
+def free_runs(theta: Theta, period: float) -> tuple[Theta, Theta, int]:
+    """Coefficients for free runs in which the nozzle goes off, and on again; rows of these runs.
+
+    In the second one there is a flow back, so that the vacuum falls to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
     leaky = theta.copy()
     leaky[c.BACK_FLOW] += gas * (theta[c.H1] - theta[c.H1_LOW]) / HELD
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
-    rows = min(int(rows_to_h1 + HELD / knees.period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
+    rows_to_h1 = GAMMA * theta[c.H1] / _bend(theta, period)
+    rows = min(int(rows_to_h1 + HELD / period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
+    return theta, leaky, rows
+
+
+def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
+    """``knees`` with delays and distance as in free runs.
+
+    Jet and sensor delay a breakpoint; the step at the port advances it. While that step oscillates
+    in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
+    does not show how high, the window covers the oscillation, over which it averages out.
+    """
+    theta, leaky, rows = free_runs(theta, knees.period)
     tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
     swing_period_rows = round(
         swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period
@@ -103,7 +115,8 @@ def _as_in_free_run(knees: Knees, theta: Theta, rows_to_h1: float) -> Knees:
         knees = replace(knees, on_shift=leaking.on_rows)
     apart = min(RINGS * tight.rings, MOST_APART * float(theta[c.H1] - theta[c.H1_LOW]))
     again = max(knees.again, knees.on_shift, knees.off_shift)
-    return replace(knees, again=again, apart=apart)
+    goes_off = float(theta[c.AMBIENT_NOMINAL]) - tight.off * MBAR
+    return replace(knees, again=again, apart=apart, goes_off=goes_off)
 
 
 def as_wide_as_needed(knees: Knees, blocks: Iterable[Samples]) -> Knees:

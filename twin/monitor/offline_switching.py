@@ -41,7 +41,8 @@ TURN, TURN_SHARE = 12.0, 0.015
 HALFWAY = 0.5  # of the vacuum; before it the nozzle does not go off
 RETURN = 0.25  # of the rise: a new fall must come as near to the level where the nozzle went off
 SPEED = 0.4  # least duration of a new fall over that of the first; a line that rings is faster
-LIKE_OTHERS, MOST = 0.5, 0.8  # least rise over the hysteresis; quantile of rises taken for that
+# Least rise over the hysteresis, if a slow fall follows or not; quantile of rises taken for it.
+LIKE_OTHERS, AS_OTHERS, MOST = 0.5, 0.8, 0.8
 # Levels between which a fall's scale is timed, as shares from its end: for the first fall of a
 # suction, and for later ones.
 FIRST_FALL, LATER_FALL = (0.16, 0.06), (0.5, 0.2)
@@ -58,6 +59,7 @@ BREAKS, BREAKS_CLEARLY, BREAKS_AS_KNOWN, CLEARLY, RISES = 0.32, 0.2, 0.1, 100.0,
 CLEAR, CLEAR_AT_LEVEL, CLEAR_ALONE = 8.0, 5.0, 16.0
 OTHERS = 1.0 / 3.0  # share of the suctions that must show a switching for its level to be known
 SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # largest distance from it: sigmas, or of the vacuum
+SHARE_OF_USUAL = 0.08  # the same from that of a known unit, of which something may have changed
 # Longest time from a report to its switching in the pressure (a valve, and a slow IO-Link cycle);
 # share of the readings in suction that must have a report.
 TOLD_WITHIN, MOST_TOLD = 50.0 * MS, 0.98
@@ -106,15 +108,20 @@ def noise_of(samples: Samples, phase: npt.NDArray[np.uint8]) -> Noise:
     return Noise.of(pressure, pressure[phase[rows] == Phase.IDLE], period, falls)
 
 
-def switchings(samples: Samples, phase: npt.NDArray[np.uint8], noise: Noise) -> list[Switching]:
-    """Find all switchings in ``samples``; ``phase`` of each row is by commands alone."""
+def switchings(
+    samples: Samples, phase: npt.NDArray[np.uint8], noise: Noise, usual: float = np.nan
+) -> list[Switching]:
+    """Find all switchings in ``samples``; ``phase`` of each row is by commands alone.
+
+    ``usual`` is the pressure (Pa) at which the nozzle of a known unit goes off.
+    """
     time, pressure, sucks, rows = _readings(samples, phase)
     if np.count_nonzero(sucks) < LEAST_ROWS:
         return []
     course = Course(time, pressure, noise)
     suctions = list(_suctions(time, sucks, noise.period))
     reported = samples["reported"][rows]
-    knees = _all_knees(course, suctions)
+    knees = _all_knees(course, suctions, usual)
     switch_times = [(knee.time, knee.on) for knee in knees]
     if reports_nozzle(reported[sucks]):
         switch_times = sorted(
@@ -186,12 +193,16 @@ def _falls(pressure: Floats, suctions: Iterable[Rows]) -> Floats:
     return np.concatenate(parts)
 
 
-def _all_knees(course: Course, suctions: Sequence[Rows]) -> list[Knee]:
+def _all_knees(course: Course, suctions: Sequence[Rows], usual: float) -> list[Knee]:
     """All breakpoints that the pressure of a record shows, in order of time."""
     levels: Levels | None = None
     knees = list[Knee]()
     for _ in range(2):
-        knees = [knee for suction in suctions for knee in _Suction(course, suction, levels).knees()]
+        knees = [
+            knee
+            for suction in suctions
+            for knee in _Suction(course, suction, levels, usual).knees()
+        ]
         levels = Levels.of(knees, len(suctions))
     for on in (False, True):
         align(course, [knee for knee in knees if knee.on == on])
@@ -208,6 +219,7 @@ class _Suction:
     course: Course
     rows: Rows
     levels: Levels | None
+    usual: float  # Pa, or NaN
 
     def knees(self) -> Iterator[Knee]:
         """Breakpoints of the suction in order: off, on, off, and so on."""
@@ -259,7 +271,7 @@ class _Suction:
             slow = _rows_between(smooth[high:], *between) + 1 >= SPEED * _rows_between(
                 lowest, *between
             )
-            if least_rise or slow:
+            if slow or (self.levels and rise >= AS_OTHERS * self.levels.hysteresis > 0.0):
                 restarts.append(high)
         return restarts[1:]
 
@@ -277,7 +289,7 @@ class _Suction:
         rows = max(_first_below(smooth, lowest + low * depth, len(smooth)) - begin, 4)
         scale = rows * course.period
         slope = (high - low) * depth / scale
-        best = self._clearest_break(_Fall(first, last, begin, rows, slope, lowest, depth, later))
+        best = self._clearest_break(_Fall(first, last, begin, rows, slope, depth, later))
         if not again:
             if best is None:
                 return None
@@ -306,11 +318,13 @@ class _Suction:
 
     def _is_off(self, best: "_SlopeBreak", rise: float, depth: float) -> bool:
         """Whether a break is clear enough; limits are lower at the level of the other suctions."""
-        least, at_level = CLEAR, False
-        if self.levels:
-            tolerance = max(SIGMAS_OF_LEVEL * self.levels.sigma, SHARE_OF_LEVEL * depth)
-            at_level = abs(best.level - self.levels.off) < tolerance
-            least = CLEAR_AT_LEVEL if at_level else CLEAR_ALONE
+        levels = self.levels
+        if levels and np.isfinite(levels.off):
+            tolerance = max(SIGMAS_OF_LEVEL * levels.sigma, SHARE_OF_LEVEL * depth)
+            at_level = abs(best.level - levels.off) < tolerance
+        else:  # so far
+            at_level = abs(best.level - self.usual) < SHARE_OF_USUAL * depth
+        least = CLEAR_AT_LEVEL if at_level else CLEAR_ALONE if levels else CLEAR
         share = BREAKS_CLEARLY if best.clear >= CLEARLY else BREAKS
         share = BREAKS_AS_KNOWN if at_level or rise >= RISES * depth else share
         return best.clear >= least and best.share >= share
@@ -323,7 +337,8 @@ class _Suction:
         count = (fall.last - fall.first) // rows_per_bin
         means = course.pressure[fall.first : fall.first + count * rows_per_bin]
         means = means.reshape(count, rows_per_bin).mean(axis=1)
-        level = np.convolve(means, np.ones(3) / 3.0, "same")
+        padded = np.pad(means, 1, "edge")  # a line without flow raises the pressure at once
+        level = np.minimum(np.minimum(padded[:-2], padded[2:]), means)
         sigma = np.sqrt(course.noise.at(fall.slope) / bin_time)
         side = int(np.ceil(course.noise.side / bin_time))
         windows = {max(int(fall.scale / rows_per_bin * width), side, 4) for width in BEFORE}
@@ -343,7 +358,7 @@ class _Suction:
             is_candidate &= (bins - before) * rows_per_bin >= fall.begin - max(
                 fall.scale, side * rows_per_bin
             )
-            is_candidate &= level[bins] <= fall.lowest + NEAR_THE_END[fall.later] * fall.depth
+            is_candidate &= level[bins] <= means.min() + NEAR_THE_END[fall.later] * fall.depth
             is_candidate &= (left < -FALLING * fall.slope) | (right > RISING * fall.slope)
             is_candidate &= right > ENDED * left
             clear = np.where(
@@ -373,13 +388,15 @@ class _Suction:
         jump += max(turn_pressure - float(course.pressure[after]), 0.0) / (half * course.period)
         jump = max(jump, 1e-3)
         reach = max(3, min(since // 4, int(ON_WITHIN / course.period)))
-        placed_break = placed(course, (first + 1, last), row, reach, max(since, 8), -jump)
-        scale = since * course.period
-        if placed_break is None:
-            return Knee(True, float(course.time[row]), turn_pressure, (first, last), jump, scale)
-        return Knee(
-            True, placed_break.time, placed_break.level, (first, last), placed_break.jump, scale
-        )
+        rows_around, scale = (first + 1, last), since * course.period
+        knee = Knee(True, float(course.time[row]), turn_pressure, (first, last), jump, scale)
+        placed_break = placed(course, rows_around, row, reach, max(since, 8), -jump)
+        if stepped_break := stepped(course, rows_around, row, max(half, 12), -jump):
+            knee.time, knee.level, knee.stepped = stepped_break.time, stepped_break.level, True
+        elif placed_break:
+            knee.time, knee.level = placed_break.time, placed_break.level
+            knee.jump = placed_break.jump
+        return knee
 
 
 class _Fall(NamedTuple):
@@ -390,7 +407,6 @@ class _Fall(NamedTuple):
     begin: int  # rows after the first from which the nozzle may go off
     scale: int  # rows
     slope: float  # Pa/s, mean of the fall over its scale
-    lowest: float  # Pa
     depth: float  # Pa
     later: bool  # not the first of its suction
 

@@ -15,13 +15,19 @@ from twin.model import dense_solver as strides
 from twin.model import theta as c
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
-from twin.monitor.bins import Floats
+from twin.monitor.bins import Floats, Ints
+from twin.monitor.breakpoints import Noise
+from twin.monitor.offline_switching import switchings
 from twin.monitor.switching_detector import Knees, PhaseFinder
-from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
+from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle
 FALLS = 3.0  # times the noise: a reading falls back by more while a line rings
+COPIES = 4  # as breakpoints of a record are placed together
+LATEST = 100.0 * MS  # s, of a breakpoint after the valve's action
 Bytes = npt.NDArray[np.uint8]
+_OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
+_RESPONSES = {Phase.HOLD: c.RESPONSE_OFF, Phase.SUCTION: c.RESPONSE}
 
 
 @dataclass(frozen=True)
@@ -58,26 +64,50 @@ def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
     The model has steps of a millisecond, as the control of an ejector; rows have the period of
     ``knees``.
     """
-    steps_per_row = max(round(knees.period / MS), 1)
-    commands = np.full((IDLE_ROWS + rows) * steps_per_row, Command.SUCTION, np.uint8)
-    commands[: IDLE_ROWS * steps_per_row] = 0
-    dt = np.full(len(commands), MS)
+    samples = _suction(rows, knees.period)
+    return [_detect(samples, _run(theta, rows, knees.period), knees) for theta in thetas]
+
+
+def shows_late(theta: Theta, rows: int, noise: Noise, name: Phase) -> float:
+    """Time (s) from the valve's action into ``name`` until a whole record shows it, if it does.
+
+    The record consists of copies of a free run for ``rows``, and is read as one with ``noise``.
+    """
+    run, samples = _run(theta, rows, noise.period), _suction(rows, noise.period)
+    samples["pressure"] = run.expected
+    record, row_ns = np.tile(samples, COPIES), round(noise.period / NS)
+    record["time_ns"] = np.arange(len(record)) * row_ns
+    phase = np.where(record["commands"] == Command.SUCTION, Phase.SUCTION, Phase.IDLE)
+    found = switchings(record, phase.astype(np.uint8), noise)
+    times = np.array([shown.time for shown in found if shown.on == (name == Phase.SUCTION)])
+    late = times % (len(samples) * row_ns * NS) - run.acts(name)
+    late = late[np.abs(late) < LATEST]
+    return float(np.median(late)) if len(late) else 0.0
+
+
+def _suction(rows: int, period: float) -> Samples:
+    """Rows of a suction from rest, without pressure."""
     samples = np.zeros(IDLE_ROWS + rows, SAMPLE)
     samples["sequence"] = np.arange(len(samples))
-    samples["time_ns"] = np.arange(len(samples)) * steps_per_row * 1_000_000
-    samples["commands"] = commands[::steps_per_row]
-    switchings = []
-    for theta in thetas:
-        phase, expected = strides.simulate(theta, dt, commands)
-        run = _Run(theta, phase[::steps_per_row], expected[::steps_per_row], knees.period)
-        switchings.append(_detect(samples, run, knees))
-    return switchings
+    samples["time_ns"] = np.arange(len(samples)) * max(round(period / MS), 1) * 1_000_000
+    samples["commands"][IDLE_ROWS:] = Command.SUCTION
+    return samples
+
+
+def _run(theta: Theta, rows: int, period: float) -> "_Run":
+    """A free run of the model in such rows."""
+    steps_per_row = max(round(period / MS), 1)
+    commands = np.full((IDLE_ROWS + rows) * steps_per_row, Command.SUCTION, np.uint8)
+    commands[: IDLE_ROWS * steps_per_row] = 0
+    phase, expected = strides.simulate(theta, np.full(len(commands), MS), commands)
+    return _Run(theta, phase, phase[::steps_per_row], expected[::steps_per_row], period)
 
 
 class _Run(NamedTuple):
     """A free run of the model, sampled in rows."""
 
     theta: Theta
+    control: Bytes  # phase in each millisecond
     phase: Bytes
     expected: Floats  # Pa, readings of the sensor
     period: float  # s, from row to row
@@ -85,6 +115,11 @@ class _Run(NamedTuple):
     def rows(self, coefficient: int) -> int:
         """A coefficient that is a time, in rows."""
         return round(float(self.theta[coefficient]) / self.period)
+
+    def acts(self, name: Phase) -> float:
+        """Time (s) at which the valve first acts after the control switched; NaN if it does not."""
+        switched = _switched(self.control, name)
+        return switched[0] * MS + float(self.theta[_RESPONSES[name]]) if len(switched) else np.nan
 
 
 def _detect(samples: Samples, run: _Run, knees: Knees) -> Seen:
@@ -103,17 +138,20 @@ def _first_switching(
     run: _Run, detected: Bytes, level: Floats, name: Phase
 ) -> tuple[float, int, float]:
     """Vacuum, rows and level above the reading, for the first switching into ``name``."""
-    phase, expected = run.phase, run.expected
-    before = Phase.SUCTION if name == Phase.HOLD else Phase.HOLD
-    switched = np.flatnonzero((phase[1:] == name) & (phase[:-1] == before)) + 1
+    switched, before = _switched(run.phase, name) + 1, _OTHER[name]
     knees = np.flatnonzero(np.isfinite(level) & (detected == name))
     knees = knees[np.isin(detected[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
     if not len(switched) or not len(knees):
         return np.nan, 0, 0.0
-    response = run.rows(c.RESPONSE_OFF if name == Phase.HOLD else c.RESPONSE)
-    rows = int(knees[0] - switched[0] - response)
+    rows = int(knees[0] - switched[0] - run.rows(_RESPONSES[name]))
     vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
-    return float(vacuum), rows, float(level[knees[0]] - expected[knees[0]])
+    return float(vacuum), rows, float(level[knees[0]] - run.expected[knees[0]])
+
+
+def _switched(phase: Bytes, name: Phase) -> Ints:
+    """Last rows before the nozzle switches into ``name``."""
+    rows: Ints = np.flatnonzero((phase[1:] == name) & (phase[:-1] == _OTHER[name]))
+    return rows
 
 
 def _rings(run: _Run, falls: float) -> float:

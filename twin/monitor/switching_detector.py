@@ -10,7 +10,8 @@ If suction ends too soon after a switching, its knee does not show. Then the lev
 nozzle went off where the pressure fell below that at which it went off before.
 
 If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
-pressure does not show a reported switching, it is placed where the valve must have acted.
+pressure does not show a reported switching, it is placed where the valve must have acted. In a log,
+switchings are told instead: knees are where the whole log shows them.
 """
 
 import math
@@ -61,7 +62,8 @@ class Knees:
     least ``again`` rows after the last one, and ``apart`` (Pa) from it. A window of more
     than ``longest`` rows could take the approach of the end pressure for a knee. If the ejector
     reports its nozzle, a knee is within ``about`` rows of the report, and the valve acts ``acts``
-    rows after it (closing, opening).
+    rows after it (closing, opening). With ``about`` = 0 knees are exactly where they are told. In a
+    free run the nozzle is seen to go off at ``goes_off`` (Pa), if it does.
     """
 
     window: int
@@ -76,6 +78,7 @@ class Knees:
     about: int = 50
     acts: tuple[int, int] = (10, 10)
     period: float = MS
+    goes_off: float = math.nan
 
     @property
     def settles(self) -> int:
@@ -210,10 +213,10 @@ def _find(
         starts = suction and state[_AGE] < 0.0
         may_bend = suction and window > 0 and state[_AGE] >= settled + window
         same = end - row - 1
-        later = (
-            max(window, int(settings[7])) if reported[row] & _KNOWN else window
-        )  # rows to be known
-        if may_bend and same < later and end == len(commands):
+        is_told = reported[row] & _KNOWN
+        later = max(window, int(settings[7])) if is_told else window  # rows to be known
+        least = later if may_bend else 1 if suction and is_told else 0
+        if window > 0 and same < least and end == len(commands):
             return row
         if suction:
             state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
@@ -230,13 +233,32 @@ def _find(
             if suction and state[_NOZZLE] > 0.0:
                 phase[row] = _SUCTION
         if suction and window > 0:
-            looks = may_bend and same >= window
-            _track_break(state, pressure, reported[:end], row, settings, looks, phase, level)
-            if reported[row] & _KNOWN:
-                _follow_report(state, pressure, reported, row, settings, phase, level)
-            else:
-                _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
+            rows = pressure, reported[:end]
+            _search(state, rows, row, settings, may_bend, phase, level)
     return len(pressure)
+
+
+@per_row
+def _search(
+    state: _Floats,
+    rows: tuple[_Floats, _Bytes],
+    row: int,
+    settings: _Floats,
+    may_bend: bool,
+    phase: _Bytes,
+    level: _Floats,
+) -> None:
+    """Look for a knee in a row of suction; ``rows`` are pressures, and reports to its end."""
+    pressure, reported = rows
+    same = len(reported) - row - 1
+    is_told, is_exact = reported[row] & _KNOWN, settings[7] == 0.0
+    if not (is_told and is_exact):
+        looks = may_bend and same >= int(settings[0])
+        _track_break(state, pressure, reported, row, settings, looks, phase, level)
+    if is_told:
+        _follow_reports(state, pressure, reported, row, settings, same == 0, phase, level)
+    else:
+        _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
 
 
 @per_row
@@ -406,7 +428,25 @@ def _is_denied(state: _Floats, reported: _Bytes, row: int, settings: _Floats) ->
 @per_row
 def _overdue(settings: _Floats) -> int:
     """Rows after which a reported switching that has not shown will not show."""
-    return int(settings[7]) + int(settings[0]) // 2
+    return int(settings[7]) + int(settings[0]) // 2 if settings[7] > 0.0 else 0
+
+
+@per_row
+def _follow_reports(
+    state: _Floats,
+    pressure: _Floats,
+    reported: _Bytes,
+    row: int,
+    settings: _Floats,
+    is_last: bool,
+    phase: _Bytes,
+    level: _Floats,
+) -> None:
+    """Take the report that is overdue, or all at the last row of a suction."""
+    state[_SINCE] += 1.0
+    overdue_row, begin = row - _overdue(settings), row - int(state[_SINCE])
+    for report_row in range(max(overdue_row, begin, 0), (row if is_last else overdue_row) + 1):
+        _follow_report(state, pressure, reported, row, report_row, settings, phase, level)
 
 
 @per_row
@@ -415,28 +455,51 @@ def _follow_report(
     pressure: _Floats,
     reported: _Bytes,
     row: int,
+    report_row: int,
     settings: _Floats,
     phase: _Bytes,
     level: _Floats,
 ) -> None:
-    """Take an overdue report; if no knee has shown it, set one by the report alone."""
-    state[_SINCE] += 1.0
-    report_row, begin = row - _overdue(settings), row - int(state[_SINCE])
-    if report_row < begin or report_row < 0:
-        return
+    """Take a report of the past; if no knee has shown it, set one by the report alone."""
     new_reports, state[_SAID] = _reported_switches(
-        reported, report_row, report_row + 1, begin, settings[7], state[_SAID]
+        reported,
+        report_row,
+        report_row + 1,
+        row - int(state[_SINCE]),
+        settings[7],
+        state[_SAID],
     )
     state[_REPORTS] += new_reports
     if new_reports == 0 or state[_REPORTS] <= state[_SWITCHED]:
         return
-    nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
-    knee = report_row + int(min(settings[8] if nozzle_on else settings[9], settings[7]))
-    level[knee] = state[_KNEE_LEVEL] = _level_before(pressure, knee)
+    nozzle_on, window, is_exact = state[_NOZZLE] > 0.0, int(settings[0]), settings[7] == 0.0
+    acts = 0 if is_exact else int(min(settings[8] if nozzle_on else settings[9], settings[7]))
+    knee = min(report_row + acts, row)
+    if is_exact:
+        level[knee] = _level_after(pressure, knee - 1, _same_before(phase, knee, window))
+    else:
+        level[knee] = _level_before(pressure, knee)
+    state[_KNEE_LEVEL] = level[knee]
     phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
     state[_SWITCHED] += 1.0
     state[_AGE] = (row - knee) + window + settings[4] - settings[5]  # as after a knee that shows
+
+
+@per_row
+def _level_after(pressure: _Floats, row: int, rows: int) -> float:
+    """Pressure (Pa) to which a line through ``rows`` up to a row leads in the next."""
+    slope, middle = _line(pressure, row - rows + 1, rows)
+    return middle + 0.5 * (rows + 1) * slope
+
+
+@per_row
+def _same_before(phase: _Bytes, row: int, most: int) -> int:
+    """Number of rows, two to ``most``, that have the same phase up to ``row``, and itself."""
+    rows = 2
+    while rows < most and row - rows >= 0 and phase[row - rows] == phase[row - 1]:
+        rows += 1
+    return rows
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
@@ -458,9 +521,13 @@ def commanded(samples: Samples, blow_off: tuple[float, float]) -> Found:
 
 @dataclass
 class PhaseFinder:
-    """Gives blocks back a little later, with phases and synchronisation levels."""
+    """Gives blocks back a little later, with phases and synchronisation levels.
+
+    ``nozzle`` replaces what the ejector reports of it: bits as in ``Reported`` of all rows to come.
+    """
 
     knees: Knees
+    nozzle: npt.NDArray[np.uint8] | None = None
     _state: npt.NDArray[np.float64] = field(default_factory=lambda: np.array(_BEGINNING))
     _rows: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
     _valve_commands: npt.NDArray[np.uint8] = field(
@@ -471,6 +538,7 @@ class PhaseFinder:
     _level: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     _seen: int = 0  # rows of _rows that were searched
     _given: int = 0  # rows of _rows that were given out and stay as context
+    _dropped: int = 0  # rows so far that are no more among _rows
 
     def push(self, block: Samples) -> Found:
         """Take a block; give the rows that are settled, their phases and their levels (Pa)."""
@@ -492,6 +560,7 @@ class PhaseFinder:
             self._phase[remaining_rows],
             self._level[remaining_rows],
         )
+        self._dropped += len(self._rows)
         self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
         self._valve_commands, self._timer = np.empty(0, "u1"), new_timer()
         self._phase, self._level = np.empty(0, "u1"), np.empty(0)
@@ -513,6 +582,7 @@ class PhaseFinder:
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
         self._level, self._valve_commands = self._level[drop:], self._valve_commands[drop:]
         self._seen -= drop
+        self._dropped += drop
         self._given -= drop
         return settled_rows
 
@@ -544,7 +614,13 @@ class PhaseFinder:
             ],
             np.float64,
         )
-        reported = np.ascontiguousarray(self._rows["reported"])
-        rows = pressure, reported, self._valve_commands
+        rows = pressure, self._reported(), self._valve_commands
         self._seen = _find(self._state, *rows, self._seen, settings, self._phase, self._level)
         return self._seen - int(_unsettled(self._state, settings))
+
+    def _reported(self) -> npt.NDArray[np.uint8]:
+        """What is told of the nozzle in each row."""
+        if self.nozzle is None:
+            return np.ascontiguousarray(self._rows["reported"])
+        told = self.nozzle[self._dropped : self._dropped + len(self._rows)]
+        return np.pad(told, (0, len(self._rows) - len(told)))  # a log may have grown meanwhile

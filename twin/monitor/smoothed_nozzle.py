@@ -1,0 +1,106 @@
+"""The nozzle in each row of a log as the whole log shows it.
+
+While monitoring, a switching is found from the rows up to now and a few later ones. A log has them
+all, and other suctions that show where the nozzle switches. So calibration and diagnosis learn the
+switchings from the whole log; the switching detector sets its knees there and nowhere else.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from twin.model.theta import Theta
+from twin.monitor.breakpoints import Noise
+from twin.monitor.detector_window import NEVER, as_wide_as_needed, free_runs
+from twin.monitor.offline_switching import noise_of, switchings
+from twin.monitor.simulated_switching import shows_late
+from twin.monitor.switching_detector import Knees, commanded
+from twin.quality import BREAK
+from twin.signals import NS, SAMPLE, Command, Phase, Reported, Samples, joined, sampling_ms
+
+PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
+LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
+SHOWS = 40.0  # ms before suction ends: a switching needs them to show
+Bytes = npt.NDArray[np.uint8]
+_KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
+
+
+def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Knees, Bytes | None]:
+    """Settings of the detector for a whole log, and bits of ``Reported`` for each of its rows.
+
+    The nozzle is not known where suction is not commanded, where the beginning of suction is
+    missing, and while it is on just before suction ends. Without air saving there is nothing to
+    know. A switching shows as late after the valve's action as in free runs of the model with
+    coefficients ``theta``. ``blocks`` are read again and again.
+    """
+    knees = as_wide_as_needed(knees, blocks)
+    if knees.settled == NEVER:
+        return knees, None
+    search, nozzles = None, [np.empty(0, np.uint8)]
+    for piece in _pieces(blocks):
+        samples, phase, _ = commanded(piece, knees.blow_off)
+        search = search or _Search.of(theta, knees, noise_of(samples, phase))
+        nozzles.append(search.nozzle(samples, phase))
+    return replace(knees, about=0, off_shift=0, on_shift=0), np.concatenate(nozzles)
+
+
+def _pieces(blocks: Iterable[Samples]) -> Iterator[Samples]:
+    """Rows of a log in pieces that end without suction, so that a long log needs little memory."""
+    kept, count = list[Samples](), 0
+    for block in blocks:
+        kept.append(block)
+        count += len(block)
+        if count < PIECE:
+            continue
+        rows = joined(*kept)
+        idle = np.flatnonzero((rows["commands"] & Command.SUCTION) == 0)
+        if not len(idle) and count < LONGEST_PIECE:
+            continue
+        end = int(idle[-1]) if len(idle) else count
+        yield rows[:end]
+        kept, count = [rows[end:]], count - end
+    yield joined(np.empty(0, SAMPLE), *kept)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A search for switchings in the pieces of a log."""
+
+    noise: Noise
+    goes_off: float  # Pa
+    late: tuple[float, float]  # s, from the valve's action until its closing and its opening show
+
+    @classmethod
+    def of(cls, theta: Theta, knees: Knees, noise: Noise) -> "_Search":
+        tight, leaky, rows = free_runs(theta, knees.period)
+        off = shows_late(tight, rows, noise, Phase.HOLD)
+        on = shows_late(leaky, rows, noise, Phase.SUCTION)
+        return cls(noise, knees.goes_off, (off, on))
+
+    def nozzle(self, samples: Samples, phase: Bytes) -> Bytes:
+        """The bits of a piece."""
+        nozzle, shows = np.zeros(len(samples), np.uint8), round(SHOWS / sampling_ms(samples))
+        found = switchings(samples, phase, self.noise, self.goes_off)
+        shown = np.array([switching.row for switching in found], np.int64)
+        seconds = (samples["time_ns"] - samples["time_ns"][:1]) * NS
+        for first, last in _suctions(phase, (samples["quality"] & BREAK) != 0):
+            nozzle[first:last] = _KNOWN | _ON
+            for switching in found[slice(*np.searchsorted(shown, (first, last)))]:
+                acts = switching.time - self.late[switching.on]
+                row = first + 1 + int(np.abs(seconds[first:last] - acts).argmin())
+                nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
+            end = slice(max(last - shows, first), last)
+            if (nozzle[end] & _ON).all():
+                nozzle[end] = 0
+        return nozzle
+
+
+def _suctions(phase: Bytes, breaks: npt.NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Rows of suctions from their beginning to their end, or to a break."""
+    ends = np.flatnonzero((np.diff(phase, prepend=np.uint8(Phase.SUCTION)) != 0) | breaks)
+    for first, last in pairwise([*ends.tolist(), len(phase)]):
+        if phase[first] == Phase.SUCTION and not breaks[first]:
+            yield first, last
