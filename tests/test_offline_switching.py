@@ -8,8 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import rigs
-from nozzle_found import Score, leaky, scored, told
+from nozzle_found import Score, leaky, scored, told, true
+from second_rigs import samples_of
 from second_world.draw import draw_rig
+from second_world.faults import Fault
 from second_world.records import record
 
 from twin.calibration.cycles import Cycles
@@ -197,6 +199,38 @@ def test_rows_that_are_missing_or_bad_say_nothing() -> None:
     assert [samples["time_ns"][switching.row] for switching in found] == pytest.approx(
         [1e9 * switching.time for switching in found], abs=2e6
     )
+
+
+def test_where_a_known_unit_goes_off_decides_what_a_record_does_not() -> None:
+    """A fault may let the slope break less than that of a healthy unit anywhere in the market."""
+    rig = draw_rig(198130)
+    fault = Fault("heat_exchange", {"film_coefficient": 25.5})
+    logged = record(rig, 26_813_000, 12, [fault])
+    samples = samples_of(logged)
+    phase = told(samples)
+    noise = noise_of(samples, phase)
+    vacuum = rig.air_saving.h1 * (1.0 + rig.sensor.gain_error)
+    usual = rig.surroundings.ambient_pressure - vacuum
+    known = switchings(samples, phase, noise, usual)
+    assert len(known) == len(true(logged)) > len(switchings(samples, phase, noise))
+    at = np.array([switching.time for switching in known])
+    assert at == pytest.approx([at for at, *_ in true(logged)], abs=0.02)
+    elsewhere = switchings(samples, phase, noise, usual + 0.2 * vacuum)
+    assert len(elsewhere) < len(known)
+
+
+def test_a_line_that_steps_as_the_nozzle_goes_on_is_timed_by_its_step() -> None:
+    """A slow rise, then a step down at once: the mean course alone would place it far off."""
+
+    def course(ms: Floats) -> Floats:
+        off, on = 400.0, 1100.0
+        low = falls(np.array(off))
+        held = low + 8.0 + 0.02 * (ms - off)
+        again = low + 8.0 + 0.02 * (on - off) - 12.0 - 0.02 * (ms - on)
+        return np.where(ms < off, falls(ms), np.where(ms < on, held, again))
+
+    found = switched(stream(course, noise=0.6))
+    assert times(found, on=True) == pytest.approx(np.full(CYCLES, 1100.0), abs=4.0)
 
 
 def test_noise_is_read_with_hum_and_the_converters_steps() -> None:

@@ -1,0 +1,108 @@
+"""The nozzle as a whole log shows it, and the twin of a diagnosis that is told so."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rigs
+from test_reported_nozzle import NEAR, off_by, silent, simulated, switched
+
+from twin.model.dataset import coefficients
+from twin.monitor.detector_window import knees_of
+from twin.monitor.smoothed_nozzle import smoothed
+from twin.monitor.switching_detector import PhaseFinder
+from twin.quality import Quality
+from twin.signals import Command, Phase, Reported, Samples
+
+Bytes = npt.NDArray[np.uint8]
+KNOWN, ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
+
+
+def nozzle(samples: Samples, name: str = "gripper") -> Bytes:
+    told = smoothed(rigs.theta(name), rigs.knees(name), [samples])[1]
+    assert told is not None
+    return told
+
+
+def phases(samples: Samples, size: int = 5000, name: str = "gripper") -> Bytes:
+    finder = PhaseFinder(*smoothed(rigs.theta(name), rigs.knees(name), [samples]))
+    parts = [finder.push(block)[1] for block in rigs.cut(samples, size)]
+    return np.concatenate([*parts, finder.flush()[1]])
+
+
+def test_a_log_shows_what_is_too_quick_for_the_live_detector() -> None:
+    samples, moved = simulated("gripper", 0.0, small=True)
+    found = switched(phases(silent(samples)))
+    assert np.abs(off_by(found, moved)).max() <= 3
+    suction = np.pad(samples["commands"] == Command.SUCTION, 2 * NEAR)
+    well_within = suction[found] & suction[found + 4 * NEAR] & (found < moved[-1] + NEAR)
+    assert np.abs(off_by(moved, found[well_within])).max() <= 3
+
+
+@pytest.mark.parametrize("name", ["gripper", "test_rig"])
+def test_the_valve_acts_where_it_did_not_where_it_shows(name: str) -> None:
+    samples, moved = simulated(name, 0.0, small=False)
+    off = off_by(switched(phases(silent(samples), name=name)), moved)
+    assert np.abs(off).max() <= 4
+    assert np.std(off) < 1.0
+
+
+@pytest.mark.parametrize("size", [1, 64])
+def test_it_is_the_same_however_the_stream_is_cut(size: int) -> None:
+    samples = silent(simulated("gripper", 0.0, small=True)[0])[:6000]
+    assert (phases(samples, size) == phases(samples)).all()
+
+
+def test_pieces_of_a_long_log_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = silent(simulated("gripper", 0.0, small=False)[0])
+    whole = nozzle(samples)
+    monkeypatch.setattr("twin.monitor.smoothed_nozzle.PIECE", 4000)
+    finder_settings = rigs.theta("gripper"), rigs.knees("gripper")
+    in_pieces = smoothed(*finder_settings, list(rigs.cut(samples, 700)))[1]
+    assert in_pieces is not None
+    assert np.count_nonzero(in_pieces != whole) < 20  # a few rows earlier or later
+
+
+def test_a_suction_without_its_beginning_is_not_known() -> None:
+    samples = silent(simulated("gripper", 0.0, small=False)[0])
+    suction = samples["commands"] == Command.SUCTION
+    first = int(suction.argmax())
+    end = first + int((~suction[first:]).argmax())
+    told = nozzle(samples[first + 300 :])
+    assert not told[: end - first - 300].any()
+    second = slice(end - first - 300 + int(suction[end:].argmax()), None)
+    assert told[second][0] == ON
+    gap = samples.copy()
+    gap["quality"][first + 300] |= np.uint8(Quality.RESTART)
+    assert nozzle(gap)[first + 200] == ON
+    assert not nozzle(gap)[first + 300 : end].any()
+
+
+def test_nothing_is_known_of_an_ejector_that_saves_no_air() -> None:
+    data = rigs.config("gripper").data
+    off = data.model_copy(update={"ejector": data.ejector.model_copy(update={"air_saving": "off"})})
+    samples, _ = simulated("gripper", 0.0, small=False)
+    assert smoothed(coefficients(off), knees_of(off), [samples])[1] is None
+
+
+def test_a_nozzle_on_to_the_last_leaves_the_end_to_the_level() -> None:
+    """What happens in the last milliseconds does not show: the live detector decides by level."""
+    samples = silent(simulated("gripper", 0.0, small=False)[0])
+    suction = samples["commands"] == Command.SUCTION
+    first = int(suction.argmax())
+    short = samples.copy()
+    short["commands"][first + 150 : first + 500] = 0
+    told = nozzle(short)
+    assert told[first + 100] == ON
+    assert not told[first + 115 : first + 150].any()
+
+
+def test_what_is_told_replaces_what_the_ejector_reports() -> None:
+    samples, moved = simulated("gripper", 20.0, small=True)
+    late = switched(phases(samples))
+    assert np.mean(np.abs(off_by(late, moved)) <= 3) > 0.95
+    never = np.full(len(samples), ON, np.uint8)
+    finder = PhaseFinder(replace(rigs.knees("gripper"), about=0), never)
+    found = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
+    assert not (found == Phase.HOLD).any()
