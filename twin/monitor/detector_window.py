@@ -12,7 +12,7 @@ from twin.model.dataset import DataSet, coefficients, swing
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
-from twin.monitor.simulated_switching import seen
+from twin.monitor.simulated_switching import bend_in_free_run, seen
 from twin.monitor.switching_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
 from twin.signals import MBAR, MS, Phase, Samples
 
@@ -25,6 +25,8 @@ AGAIN = 30e-3  # s after a breakpoint before the next one: lines ring in that ti
 AT_ONCE = 2  # rows: smaller shifts are ignored; calibrated lag and shift would chase each other
 HELD = 2.0  # s for which the nozzle is off in the free run
 LONGEST_RUN = 60_000  # rows of it
+LEAST_BEND = 1e-3  # Pa per row
+LEAST_SUCTION = 0.02  # suction at H1 over that at half of it: less is next to nothing
 TOLD_LATE = 20e-3  # s, longest delay of an ejector's report: a slow IO-Link cycle and a PLC's
 RINGS = 1.5  # highest ringing of a line over that of the free run
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
@@ -73,9 +75,23 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
 
 
 def _bend(theta: Theta, period: float) -> float:
-    """Change of the slope (Pa per row) as the nozzle goes off at H1."""
-    suction = suction_at(theta, theta[c.AMBIENT] - theta[c.H1]) * R * theta[c.TEMPERATURE]
-    return float(max(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period, 1e-3))
+    """Change of the slope (Pa per row) as the nozzle goes off at H1.
+
+    If next to nothing is sucked any more where the whole line is at H1, only the sensor's end of it
+    gets there: then a free run shows the change.
+    """
+    bend, half = (_slope(theta, share * float(theta[c.H1]), period) for share in (1.0, 0.5))
+    if bend > LEAST_SUCTION * half:
+        return bend
+    rows_to_h1 = 4.0 * GAMMA * theta[c.H1] / max(half, LEAST_BEND)
+    rows = min(int(rows_to_h1 + HELD / period), LONGEST_RUN)
+    return max(bend, bend_in_free_run(theta, rows, period), LEAST_BEND)
+
+
+def _slope(theta: Theta, vacuum: float, period: float) -> float:
+    """Fall of the pressure (Pa per row) by the ejector at a vacuum (Pa) in the whole line."""
+    suction = suction_at(theta, theta[c.AMBIENT] - vacuum) * R * theta[c.TEMPERATURE]
+    return float(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period)
 
 
 def free_runs(theta: Theta, period: float) -> tuple[Theta, Theta, int]:
@@ -87,7 +103,7 @@ def free_runs(theta: Theta, period: float) -> tuple[Theta, Theta, int]:
     leaky = theta.copy()
     leaky[c.BACK_FLOW] += gas * (theta[c.H1] - theta[c.H1_LOW]) / HELD
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
-    rows_to_h1 = GAMMA * theta[c.H1] / _bend(theta, period)
+    rows_to_h1 = GAMMA * theta[c.H1] / max(_slope(theta, float(theta[c.H1]), period), LEAST_BEND)
     rows = min(int(rows_to_h1 + HELD / period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
     return theta, leaky, rows
 

@@ -18,7 +18,7 @@ from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.breakpoints import Noise
 from twin.monitor.offline_switching import switchings
-from twin.monitor.switching_detector import Knees, PhaseFinder
+from twin.monitor.switching_detector import SHORTEST_WINDOW, Knees, PhaseFinder
 from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # before the cycle
@@ -83,6 +83,19 @@ def shows_late(theta: Theta, rows: int, noise: Noise, name: Phase) -> float:
     late = times % (len(samples) * row_ns * NS) - run.acts(name)
     late = late[np.abs(late) < LATEST]
     return float(np.median(late)) if len(late) else 0.0
+
+
+def bend_in_free_run(theta: Theta, rows: int, period: float) -> float:
+    """Change of the slope (Pa per row) in a free run as the nozzle goes off; 0 if it does not."""
+    run = _run(theta, rows, period)
+    acts = run.acts(Phase.HOLD)
+    row = round(acts / period) if np.isfinite(acts) else len(run.expected)
+    slow = round(2.0 * float(theta[c.SENSOR_LAG] + theta[c.SLOW_SENSOR]) / period)
+    before, after = run.expected[:row], run.expected[row + slow :]
+    if min(len(before), len(after)) <= SHORTEST_WINDOW:
+        return 0.0
+    fall, rise = before[-1 - SHORTEST_WINDOW] - before[-1], after[SHORTEST_WINDOW] - after[0]
+    return float(fall + rise) / SHORTEST_WINDOW
 
 
 def _suction(rows: int, period: float) -> Samples:

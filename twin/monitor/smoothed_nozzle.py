@@ -19,11 +19,10 @@ from twin.monitor.offline_switching import noise_of, switchings
 from twin.monitor.simulated_switching import shows_late
 from twin.monitor.switching_detector import Knees, commanded
 from twin.quality import BREAK
-from twin.signals import NS, SAMPLE, Command, Phase, Reported, Samples, joined, sampling_ms
+from twin.signals import NS, SAMPLE, Command, Phase, Reported, Samples, joined
 
 PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
 LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
-SHOWS = 40.0  # ms before suction ends: a switching needs them to show
 Bytes = npt.NDArray[np.uint8]
 _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 
@@ -31,10 +30,10 @@ _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Knees, Bytes | None]:
     """Settings of the detector for a whole log, and bits of ``Reported`` for each of its rows.
 
-    The nozzle is not known where suction is not commanded, where the beginning of suction is
-    missing, and while it is on just before suction ends. Without air saving there is nothing to
-    know. A switching shows as late after the valve's action as in free runs of the model with
-    coefficients ``theta``. ``blocks`` are read again and again.
+    The nozzle is not known where suction is not commanded, and where the beginning of suction is
+    missing. Without air saving there is nothing to know. A switching shows as late after the
+    valve's action as in free runs of the model with coefficients ``theta``. ``blocks`` are read
+    again and again.
     """
     knees = as_wide_as_needed(knees, blocks)
     if knees.settled == NEVER:
@@ -82,7 +81,7 @@ class _Search:
 
     def nozzle(self, samples: Samples, phase: Bytes) -> Bytes:
         """The bits of a piece."""
-        nozzle, shows = np.zeros(len(samples), np.uint8), round(SHOWS / sampling_ms(samples))
+        nozzle = np.zeros(len(samples), np.uint8)
         found = switchings(samples, phase, self.noise, self.goes_off)
         shown = np.array([switching.row for switching in found], np.int64)
         seconds = (samples["time_ns"] - samples["time_ns"][:1]) * NS
@@ -92,9 +91,6 @@ class _Search:
                 acts = switching.time - self.late[switching.on]
                 row = first + 1 + int(np.abs(seconds[first:last] - acts).argmin())
                 nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
-            end = slice(max(last - shows, first), last)
-            if (nozzle[end] & _ON).all():
-                nozzle[end] = 0
         return nozzle
 
 

@@ -257,7 +257,7 @@ def _search(
         _track_break(state, pressure, reported, row, settings, looks, phase, level)
     if is_told:
         _follow_reports(state, pressure, reported, row, settings, same == 0, phase, level)
-    else:
+    if is_exact or not is_told:
         _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
 
 
@@ -477,6 +477,7 @@ def _follow_report(
     knee = min(report_row + acts, row)
     if is_exact:
         level[knee] = _level_after(pressure, knee - 1, _same_before(phase, knee, window))
+        state[_OFF_LEVEL] = level[knee] if nozzle_on else state[_OFF_LEVEL]
     else:
         level[knee] = _level_before(pressure, knee)
     state[_KNEE_LEVEL] = level[knee]
