@@ -1,8 +1,9 @@
 """The nozzle in each row of a log as the whole log shows it.
 
 While monitoring, a switching is found from the rows up to now and a few later ones. A log has them
-all, and other suctions that show where the nozzle switches. So calibration and diagnosis learn the
-switchings from the whole log; the switching detector sets its knees there and nowhere else.
+all, and other suctions that show where the nozzle switches. So a diagnosis learns from the whole
+log which switchings there are, and when. The detector, whose errors free runs of the model have as
+well, finds the knee of each and no others; where it finds none, the valve acts as the log shows.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,10 +20,15 @@ from twin.monitor.offline_switching import noise_of, switchings
 from twin.monitor.simulated_switching import shows_late
 from twin.monitor.switching_detector import Knees, commanded
 from twin.quality import BREAK
-from twin.signals import NS, SAMPLE, Command, Phase, Reported, Samples, joined
+from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Reported, Samples, joined
 
 PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
 LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
+ABOUT = (
+    20.0 * MS
+)  # s, between the switching that the log shows and the knee that the detector finds
+SHOWS = 40.0 * MS  # s before suction ends: a later switching does not show in the slope
+BEYOND, SIGNIFICANT = 10.0 * MBAR, 7.0  # Pa, and times the noise, below the level of switching
 Bytes = npt.NDArray[np.uint8]
 _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 
@@ -43,7 +49,10 @@ def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Kne
         samples, phase, _ = commanded(piece, knees.blow_off)
         search = search or _Search.of(theta, knees, noise_of(samples, phase))
         nozzles.append(search.nozzle(samples, phase))
-    return replace(knees, about=0, off_shift=0, on_shift=0), np.concatenate(nozzles)
+    apart = max(knees.off_shift, knees.on_shift) + max(
+        knees.window // 2, round(ABOUT / knees.period)
+    )
+    return replace(knees, about=apart, acts=(0, 0)), np.concatenate(nozzles)
 
 
 def _pieces(blocks: Iterable[Samples]) -> Iterator[Samples]:
@@ -84,6 +93,8 @@ class _Search:
         nozzle = np.zeros(len(samples), np.uint8)
         found = switchings(samples, phase, self.noise, self.goes_off)
         shown = np.array([switching.row for switching in found], np.int64)
+        offs = [samples["pressure"][s.row - 1] for s in found if not s.on]
+        least = float(np.median(offs)) if offs else -np.inf
         seconds = (samples["time_ns"] - samples["time_ns"][:1]) * NS
         for first, last in _suctions(phase, (samples["quality"] & BREAK) != 0):
             nozzle[first:last] = _KNOWN | _ON
@@ -91,7 +102,18 @@ class _Search:
                 acts = switching.time - self.late[switching.on]
                 row = first + 1 + int(np.abs(seconds[first:last] - acts).argmin())
                 nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
+            if nozzle[last - 1] & _ON:
+                off = self._by_level(samples[first:last], least)
+                nozzle[last - off : last] = _KNOWN
         return nozzle
+
+    def _by_level(self, suction: Samples, off_level: float) -> int:
+        """Rows at the end of a suction for which the nozzle must be off: it fell below a level."""
+        rows = round(SHOWS / self.noise.period)
+        pressure = suction["pressure"][-rows:].astype(np.float64)
+        if not pressure[-1] < off_level - max(BEYOND, SIGNIFICANT * self.noise.single):
+            return 0
+        return int((pressure[::-1] > off_level).argmax())  # none if it was below for longer
 
 
 def _suctions(phase: Bytes, breaks: npt.NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

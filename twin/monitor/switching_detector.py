@@ -11,7 +11,7 @@ nozzle went off where the pressure fell below that at which it went off before.
 
 If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
 pressure does not show a reported switching, it is placed where the valve must have acted. In a log,
-switchings are told instead: knees are where the whole log shows them.
+what the whole of it shows takes the place of reports.
 """
 
 import math
@@ -62,8 +62,8 @@ class Knees:
     least ``again`` rows after the last one, and ``apart`` (Pa) from it. A window of more
     than ``longest`` rows could take the approach of the end pressure for a knee. If the ejector
     reports its nozzle, a knee is within ``about`` rows of the report, and the valve acts ``acts``
-    rows after it (closing, opening). With ``about`` = 0 knees are exactly where they are told. In a
-    free run the nozzle is seen to go off at ``goes_off`` (Pa), if it does.
+    rows after it (closing, opening). In a free run the nozzle is seen to go off at ``goes_off``
+    (Pa), if it does.
     """
 
     window: int
@@ -251,13 +251,11 @@ def _search(
     """Look for a knee in a row of suction; ``rows`` are pressures, and reports to its end."""
     pressure, reported = rows
     same = len(reported) - row - 1
-    is_told, is_exact = reported[row] & _KNOWN, settings[7] == 0.0
-    if not (is_told and is_exact):
-        looks = may_bend and same >= int(settings[0])
-        _track_break(state, pressure, reported, row, settings, looks, phase, level)
-    if is_told:
+    looks = may_bend and same >= int(settings[0])
+    _track_break(state, pressure, reported, row, settings, looks, phase, level)
+    if reported[row] & _KNOWN:
         _follow_reports(state, pressure, reported, row, settings, same == 0, phase, level)
-    if is_exact or not is_told:
+    else:
         _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
 
 
@@ -428,7 +426,7 @@ def _is_denied(state: _Floats, reported: _Bytes, row: int, settings: _Floats) ->
 @per_row
 def _overdue(settings: _Floats) -> int:
     """Rows after which a reported switching that has not shown will not show."""
-    return int(settings[7]) + int(settings[0]) // 2 if settings[7] > 0.0 else 0
+    return int(settings[7]) + int(settings[0]) // 2
 
 
 @per_row
@@ -472,35 +470,14 @@ def _follow_report(
     state[_REPORTS] += new_reports
     if new_reports == 0 or state[_REPORTS] <= state[_SWITCHED]:
         return
-    nozzle_on, window, is_exact = state[_NOZZLE] > 0.0, int(settings[0]), settings[7] == 0.0
-    acts = 0 if is_exact else int(min(settings[8] if nozzle_on else settings[9], settings[7]))
+    nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
+    acts = int(min(settings[8] if nozzle_on else settings[9], settings[7]))
     knee = min(report_row + acts, row)
-    if is_exact:
-        level[knee] = _level_after(pressure, knee - 1, _same_before(phase, knee, window))
-        state[_OFF_LEVEL] = level[knee] if nozzle_on else state[_OFF_LEVEL]
-    else:
-        level[knee] = _level_before(pressure, knee)
-    state[_KNEE_LEVEL] = level[knee]
+    level[knee] = state[_KNEE_LEVEL] = _level_before(pressure, knee)
     phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
     state[_SWITCHED] += 1.0
     state[_AGE] = (row - knee) + window + settings[4] - settings[5]  # as after a knee that shows
-
-
-@per_row
-def _level_after(pressure: _Floats, row: int, rows: int) -> float:
-    """Pressure (Pa) to which a line through ``rows`` up to a row leads in the next."""
-    slope, middle = _line(pressure, row - rows + 1, rows)
-    return middle + 0.5 * (rows + 1) * slope
-
-
-@per_row
-def _same_before(phase: _Bytes, row: int, most: int) -> int:
-    """Number of rows, two to ``most``, that have the same phase up to ``row``, and itself."""
-    rows = 2
-    while rows < most and row - rows >= 0 and phase[row - rows] == phase[row - 1]:
-        rows += 1
-    return rows
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
