@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import rigs
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_reported_nozzle import NEAR, off_by, silent, simulated, switched
 
 from twin.model.dataset import coefficients
@@ -104,3 +106,32 @@ def test_what_is_told_replaces_what_the_ejector_reports() -> None:
     finder = PhaseFinder(replace(rigs.knees("gripper"), about=0), never)
     found = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
     assert not (found == Phase.HOLD).any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_log_keeps_its_rows(seed: int) -> None:
+    """Readings and commands may be missing, at random, or all the same; clocks may jump."""
+    rng = np.random.default_rng(seed)
+    samples = silent(simulated("gripper", 0.0, small=False)[0])
+    first, count = rng.integers(0, 10_000), rng.choice([0, 1, 2, 5, 30, 300, 5000])
+    samples = samples[first : first + count].copy()
+    if count and rng.random() < 0.5:
+        samples["pressure"][rng.random(count) < rng.choice([0.01, 0.3, 1.0])] = np.nan
+    if count and rng.random() < 0.4:
+        marks = np.uint8(rng.choice(list(Quality)))
+        samples["quality"][rng.integers(0, count, 1 + count // 50)] |= marks
+    if rng.random() < 0.3:
+        samples["time_ns"] = rng.choice([samples["time_ns"], rng.permutation(samples["time_ns"])])
+    if rng.random() < 0.3:
+        samples["commands"] = rng.choice([0, 1, 2, 3], count)
+    if rng.random() < 0.2:
+        samples["pressure"] = 101_300.0
+    if rng.random() < 0.1:
+        samples["commands"], samples["time_ns"] = Command.SUCTION, 0
+    finder = PhaseFinder(
+        *smoothed(rigs.theta("gripper"), rigs.knees("gripper"), rigs.cut(samples, 1 + count // 3))
+    )
+    assert finder.nozzle is not None
+    assert len(finder.nozzle) == count
+    assert len(finder.push(samples)[0]) + len(finder.flush()[0]) == count

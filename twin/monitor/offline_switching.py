@@ -100,6 +100,12 @@ class Levels:
         )
 
 
+def shows_suction(samples: Samples, phase: npt.NDArray[np.uint8]) -> bool:
+    """Whether there are readings in suction to search; ``phase`` as in ``switchings``."""
+    _, _, sucks, _ = _readings(samples, phase)
+    return bool(np.count_nonzero(sucks) >= LEAST_ROWS)
+
+
 def noise_of(samples: Samples, phase: npt.NDArray[np.uint8]) -> Noise:
     """Noise of a record's readings; ``phase`` as in ``switchings``."""
     time, pressure, sucks, rows = _readings(samples, phase)
@@ -179,7 +185,7 @@ def _suctions(time: Floats, sucks: npt.NDArray[np.bool_], period: float) -> Iter
     gap = (intervals > max(LONGEST_GAP, GAP_ROWS * period)) | (intervals <= 0.0)
     edges = np.flatnonzero(gap | np.diff(sucks)) + 1
     for first, last in pairwise([0, *edges.tolist(), len(time)]):
-        if sucks[first]:
+        if first < last and sucks[first]:
             yield first, last
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from twin.model.theta import Theta
 from twin.monitor.breakpoints import Noise
 from twin.monitor.detector_window import NEVER, as_wide_as_needed, free_runs
-from twin.monitor.offline_switching import noise_of, switchings
+from twin.monitor.offline_switching import noise_of, shows_suction, switchings
 from twin.monitor.simulated_switching import shows_late
 from twin.monitor.switching_detector import Knees, commanded
 from twin.quality import BREAK
@@ -47,6 +47,10 @@ def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Kne
     search, nozzles = None, [np.empty(0, np.uint8)]
     for piece in _pieces(blocks):
         samples, phase, _ = commanded(piece, knees.blow_off)
+        if not shows_suction(samples, phase):
+            nozzles.append(np.zeros(len(samples), np.uint8))
+            continue
+        samples = _timed_forwards(samples)
         search = search or _Search.of(theta, knees, noise_of(samples, phase))
         nozzles.append(search.nozzle(samples, phase))
     apart = max(knees.off_shift, knees.on_shift) + max(
@@ -73,6 +77,16 @@ def _pieces(blocks: Iterable[Samples]) -> Iterator[Samples]:
     yield joined(np.empty(0, SAMPLE), *kept)
 
 
+def _timed_forwards(samples: Samples) -> Samples:
+    """Rows whose time always runs on: where a clock was set back, a second passes."""
+    steps = np.diff(samples["time_ns"])
+    if (steps > 0).all():
+        return samples
+    samples = samples.copy()
+    samples["time_ns"][1:] = samples["time_ns"][0] + np.cumsum(np.where(steps > 0, steps, 10**9))
+    return samples
+
+
 @dataclass(frozen=True)
 class _Search:
     """A search for switchings in the pieces of a log."""
@@ -84,21 +98,24 @@ class _Search:
     @classmethod
     def of(cls, theta: Theta, knees: Knees, noise: Noise) -> "_Search":
         tight, leaky, rows = free_runs(theta, knees.period)
-        off = shows_late(tight, rows, noise, Phase.HOLD)
-        on = shows_late(leaky, rows, noise, Phase.SUCTION)
+        as_sampled = replace(noise, period=knees.period)
+        off = shows_late(tight, rows, as_sampled, Phase.HOLD)
+        on = shows_late(leaky, rows, as_sampled, Phase.SUCTION)
         return cls(noise, knees.goes_off, (off, on))
 
     def nozzle(self, samples: Samples, phase: Bytes) -> Bytes:
         """The bits of a piece."""
         nozzle = np.zeros(len(samples), np.uint8)
         found = switchings(samples, phase, self.noise, self.goes_off)
-        shown = np.array([switching.row for switching in found], np.int64)
-        offs = [samples["pressure"][s.row - 1] for s in found if not s.on]
-        least = float(np.median(offs)) if offs else -np.inf
+        rows_found = np.array([switching.row for switching in found], np.int64)
+        before = np.array([switching.row - 1 for switching in found if not switching.on], np.int64)
+        offs = samples["pressure"][before]
+        offs = offs[np.isfinite(offs)]
+        least = float(np.median(offs)) if len(offs) else -np.inf
         seconds = (samples["time_ns"] - samples["time_ns"][:1]) * NS
         for first, last in _suctions(phase, (samples["quality"] & BREAK) != 0):
             nozzle[first:last] = _KNOWN | _ON
-            for switching in found[slice(*np.searchsorted(shown, (first, last)))]:
+            for switching in found[slice(*np.searchsorted(rows_found, (first, last)))]:
                 acts = switching.time - self.late[switching.on]
                 row = first + 1 + int(np.abs(seconds[first:last] - acts).argmin())
                 nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
@@ -109,7 +126,7 @@ class _Search:
 
     def _by_level(self, suction: Samples, off_level: float) -> int:
         """Rows at the end of a suction for which the nozzle must be off: it fell below a level."""
-        rows = round(SHOWS / self.noise.period)
+        rows = max(round(SHOWS / self.noise.period), 1)
         pressure = suction["pressure"][-rows:].astype(np.float64)
         if not pressure[-1] < off_level - max(BEYOND, SIGNIFICANT * self.noise.single):
             return 0
