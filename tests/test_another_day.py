@@ -17,7 +17,7 @@ from twin.diagnosis.hypotheses import often, price
 from twin.diagnosis.linear_screening import columns, promises, signatures
 from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
-from twin.model.courses import Cause
+from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
@@ -101,7 +101,19 @@ def test_weather_that_somebody_measures_is_no_cheap_cause() -> None:
     effect = EFFECTS["ambient_pressure"]
     unlikely = (10.0 / effect.parameters[0].typical) ** 2 + 2.0 * math.log(len(effect.laws()))
     assert price(followed, weather) == pytest.approx(price(followed, leak) + unlikely)
-    assert often(evidence, EFFECTS["sensor_offset"]) < 1.0
+    assert often(evidence, Cause("sensor_offset", {"offset": 5.0})) < 1.0
+
+
+def test_weather_seldom_changes_while_a_log_is_recorded() -> None:
+    """Twenty millibars within a minute are more likely a sensor that drifts."""
+    samples, _ = rigs.recorded("gripper", 12.0)
+    evidence = collect(rigs.config("gripper"), [samples])
+    weather = Cause("ambient_pressure", {"shift": -8.0})
+    assert often(evidence, weather) > 1.0
+    for course in (Course.STEP, Course.RAMP, Course.INTERMITTENT):
+        assert often(evidence, replace(weather, course=course)) == 1.0
+    leak = Cause("leakage", {"sonic_flow": 1.0})
+    assert often(evidence, replace(leak, course=Course.STEP)) == often(evidence, leak)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.inference.priors import PRIOR_TEMPER
 from twin.model.courses import HOUR, Cause, Course
-from twin.model.effects import EFFECTS, Effect, Parameter, effect_of
+from twin.model.effects import EFFECTS, Parameter, effect_of
 from twin.monitor.bins import Floats
 
 LOCAL_ONSETS = 20  # onsets in a cycle that can be told apart
@@ -82,14 +82,16 @@ def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
     return sum(_price(evidence, cause) for cause in hypothesis)
 
 
-def often(evidence: Evidence, effect: Effect) -> float:
-    """Prior frequency of an effect, over that of wear."""
-    return effect.frequency(ambient_is_measured="ambient" in evidence.told)
+def often(evidence: Evidence, cause: Cause) -> float:
+    """Prior frequency of a cause, over that of wear; weather seldom changes within one log."""
+    effect = effect_of(cause.effect)
+    usual = effect.frequency(ambient_is_measured="ambient" in evidence.told)
+    return min(usual, 1.0) if effect.is_weather and cause.course != Course.CONSTANT else usual
 
 
 def rarity(evidence: Evidence, hypothesis: Hypothesis) -> float:
     """Part of the penalty that comes from the prior frequency of its effects."""
-    return sum(-2.0 * math.log(often(evidence, effect_of(cause.effect))) for cause in hypothesis)
+    return sum(-2.0 * math.log(often(evidence, cause)) for cause in hypothesis)
 
 
 def score_without_prior(evidence: Evidence, score: float, hypothesis: Hypothesis) -> float:
@@ -104,7 +106,7 @@ def score_with_tempered_prior(evidence: Evidence, score: float, hypothesis: Hypo
 
 def _price(evidence: Evidence, cause: Cause) -> float:
     effect, cycles = effect_of(cause.effect), len(evidence.judged)
-    alternatives = len(EFFECTS) * len(effect.laws()) / often(evidence, effect)
+    alternatives = len(EFFECTS) * len(effect.laws()) / often(evidence, cause)
     if cause.course == Course.STEP:
         alternatives *= LOCAL_ONSETS * cycles
     elif cause.course == Course.RAMP:
