@@ -86,6 +86,20 @@ def test_it_is_the_same_however_the_stream_is_cut(size: int) -> None:
     assert (phases(samples[:6000], size) == phases(samples[:6000])).all()
 
 
+def test_a_report_just_before_suction_ends_counts() -> None:
+    """Its knee has no rows after it; the valve acts a response later, if suction lasts so long."""
+    samples, moved = simulated("gripper", 0.0, small=False)
+    samples, end = samples.copy(), int(moved[0]) - 100
+    closing, _ = rigs.knees("gripper").acts
+    samples["commands"][end : moved[0] + 400] = 0
+    for reported, acts in ((end - closing - 8, True), (end - closing + 2, False)):
+        samples["reported"][reported:end] &= ~np.uint8(Reported.NOZZLE)
+        phase = phases(samples)
+        assert (phase[end - 1] == Phase.HOLD) == acts
+        assert not (phase[end - 40 : reported] == Phase.HOLD).any()
+        samples["reported"][reported:end] |= np.uint8(Reported.NOZZLE)
+
+
 def test_a_nozzle_that_is_reported_on_stays_on() -> None:
     samples, moved = simulated("gripper", 0.0, small=False)
     samples = samples.copy()

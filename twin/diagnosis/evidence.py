@@ -33,7 +33,7 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import least_time_ms
@@ -346,7 +346,7 @@ class Evidence:
         """Move the switching of one hypothesis, in place."""
         for knee in self._knees:
             name = Phase(int(self.ticks["phase"][knee]))
-            known_shift = self.knees.off_shift if name == Phase.HOLD else self.knees.on_shift
+            known_shift = self._known_shift(knee)
             earlier, _ = self._shift_at(knee, sensing)
             acts = max(knee - known_shift - earlier, 0)
             phase[max(knee - known_shift, 0) : knee] = _OTHER[name]
@@ -354,13 +354,21 @@ class Evidence:
             late = phase[knee : max(knee, acts)]
             late[late == name] = _OTHER[name]
 
+    def _known_shift(self, knee: int) -> int:
+        """Rows by which a knee shows late; none if the slope did not show it, but the whole log."""
+        name = self.ticks["phase"][knee]
+        shift = self.knees.off_shift if name == Phase.HOLD else self.knees.on_shift
+        return shift if shift and self.ticks["phase"][knee - 1] == name else 0
+
     def _shift_at(self, knee: int, sensing: Sequence["Sensing"]) -> tuple[int, float]:
         """Rows by which a switching acts earlier, and the level (Pa) by which it is seen higher."""
         begins = [part.row for part in sensing]
         shift = sensing[int(np.searchsorted(begins, knee, "right")) - 1]
-        if self.ticks["phase"][knee] == Phase.HOLD:
-            return shift.off, shift.off_above
-        return shift.on, shift.on_above
+        is_off = self.ticks["phase"][knee] == Phase.HOLD
+        late = self.knees.off_shift if is_off else self.knees.on_shift
+        is_read = late and not self._known_shift(knee)  # the level is a plain reading
+        above = 0.0 if is_read else shift.off_above if is_off else shift.on_above
+        return shift.off if is_off else shift.on, above
 
     @cached_property
     def _knees(self) -> Ints:
@@ -546,7 +554,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
     """The complete cycles of a log for the twin of ``base``, in the log's surroundings."""
     medians = medians_of(blocks)
     theta = surrounded(base.theta, medians)
-    knees, nozzle = smoothed(theta, base.knees, _Bridged(blocks))
+    knees = as_wide_as_needed(base.knees, _Bridged(blocks))
     base = replace(
         base,
         theta=theta,
@@ -561,7 +569,8 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
     )
     begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
-    twin = Twin(base.theta, base.knees, base.terms, nozzle)
+    told_knees, nozzle = smoothed(theta, knees, _Bridged(blocks))
+    twin = Twin(base.theta, told_knees, base.terms, nozzle)
     for cycle in cut(twin.over(_Bridged(blocks)), math.inf):
         if not cycle.complete:
             continue

@@ -94,10 +94,10 @@ def _slope(theta: Theta, vacuum: float, period: float) -> float:
     return float(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period)
 
 
-def free_runs(theta: Theta, period: float) -> tuple[Theta, Theta, int]:
-    """Coefficients for free runs in which the nozzle goes off, and on again; rows of these runs.
+def free_runs(theta: Theta, period: float) -> tuple[Theta, int]:
+    """Coefficients for a free run in which the nozzle goes on again, and rows of a free run.
 
-    In the second one there is a flow back, so that the vacuum falls to where the nozzle goes on.
+    In it there is a flow back, so that the vacuum falls to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
     leaky = theta.copy()
@@ -105,7 +105,7 @@ def free_runs(theta: Theta, period: float) -> tuple[Theta, Theta, int]:
     leaky[c.AIR_SAVING] = c.WITHOUT_CONTINUOUS
     rows_to_h1 = GAMMA * theta[c.H1] / max(_slope(theta, float(theta[c.H1]), period), LEAST_BEND)
     rows = min(int(rows_to_h1 + HELD / period) + 2 * LONGEST_WINDOW, LONGEST_RUN)
-    return theta, leaky, rows
+    return leaky, rows
 
 
 def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
@@ -115,7 +115,7 @@ def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
     in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
     does not show how high, the window covers the oscillation, over which it averages out.
     """
-    theta, leaky, rows = free_runs(theta, knees.period)
+    leaky, rows = free_runs(theta, knees.period)
     tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
     swing_period_rows = round(
         swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period

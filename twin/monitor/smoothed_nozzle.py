@@ -13,14 +13,15 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from twin.model import theta as c
 from twin.model.theta import Theta
-from twin.monitor.breakpoints import Noise
-from twin.monitor.detector_window import NEVER, as_wide_as_needed, free_runs
+from twin.monitor.breakpoints import Floats, Noise
+from twin.monitor.detector_window import NEVER, free_runs
 from twin.monitor.offline_switching import noise_of, shows_suction, switchings
 from twin.monitor.simulated_switching import shows_late
-from twin.monitor.switching_detector import Knees, commanded
-from twin.quality import BREAK
-from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Reported, Samples, joined
+from twin.monitor.switching_detector import BEYOND, SIGNIFICANT, Knees, commanded
+from twin.quality import BREAK, UNUSABLE
+from twin.signals import MS, NS, SAMPLE, Command, Phase, Reported, Samples, joined
 
 PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
 LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
@@ -28,7 +29,6 @@ ABOUT = (
     20.0 * MS
 )  # s, between the switching that the log shows and the knee that the detector finds
 SHOWS = 40.0 * MS  # s before suction ends: a later switching does not show in the slope
-BEYOND, SIGNIFICANT = 10.0 * MBAR, 7.0  # Pa, and times the noise, below the level of switching
 Bytes = npt.NDArray[np.uint8]
 _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 
@@ -37,16 +37,17 @@ def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Kne
     """Settings of the detector for a whole log, and bits of ``Reported`` for each of its rows.
 
     The nozzle is not known where suction is not commanded, and where the beginning of suction is
-    missing. Without air saving there is nothing to know. A switching shows as late after the
-    valve's action as in free runs of the model with coefficients ``theta``. ``blocks`` are read
-    again and again.
+    missing. Without air saving there is nothing to know; an ejector that reports its nozzle needs
+    no search. A switching shows as late after the valve's action as in free runs of the model with
+    coefficients ``theta``. ``blocks`` are read once more.
     """
-    knees = as_wide_as_needed(knees, blocks)
-    if knees.settled == NEVER:
+    if knees.settled == NEVER or theta[c.AIR_SAVING] == c.OFF:
         return knees, None
     search, nozzles = None, [np.empty(0, np.uint8)]
     for piece in _pieces(blocks):
         samples, phase, _ = commanded(piece, knees.blow_off)
+        if (samples["reported"] & _KNOWN).any():
+            return knees, None
         if not shows_suction(samples, phase):
             nozzles.append(np.zeros(len(samples), np.uint8))
             continue
@@ -65,15 +66,12 @@ def _pieces(blocks: Iterable[Samples]) -> Iterator[Samples]:
     for block in blocks:
         kept.append(block)
         count += len(block)
-        if count < PIECE:
+        ends = np.flatnonzero((block["commands"] & Command.SUCTION) == 0)
+        if count < PIECE or (not len(ends) and count < LONGEST_PIECE):
             continue
-        rows = joined(*kept)
-        idle = np.flatnonzero((rows["commands"] & Command.SUCTION) == 0)
-        if not len(idle) and count < LONGEST_PIECE:
-            continue
-        end = int(idle[-1]) if len(idle) else count
-        yield rows[:end]
-        kept, count = [rows[end:]], count - end
+        end = int(ends[-1]) if len(ends) else len(block)
+        yield joined(*kept[:-1], block[:end])
+        kept, count = [block[end:]], len(block) - end
     yield joined(np.empty(0, SAMPLE), *kept)
 
 
@@ -97,9 +95,9 @@ class _Search:
 
     @classmethod
     def of(cls, theta: Theta, knees: Knees, noise: Noise) -> "_Search":
-        tight, leaky, rows = free_runs(theta, knees.period)
+        leaky, rows = free_runs(theta, knees.period)
         as_sampled = replace(noise, period=knees.period)
-        off = shows_late(tight, rows, as_sampled, Phase.HOLD)
+        off = shows_late(theta, rows, as_sampled, Phase.HOLD)
         on = shows_late(leaky, rows, as_sampled, Phase.SUCTION)
         return cls(noise, knees.goes_off, (off, on))
 
@@ -108,26 +106,26 @@ class _Search:
         nozzle = np.zeros(len(samples), np.uint8)
         found = switchings(samples, phase, self.noise, self.goes_off)
         rows_found = np.array([switching.row for switching in found], np.int64)
+        unusable = (samples["quality"] & UNUSABLE) != 0
+        pressure = np.where(unusable, np.nan, samples["pressure"].astype(np.float64))
         before = np.array([switching.row - 1 for switching in found if not switching.on], np.int64)
-        offs = samples["pressure"][before]
-        offs = offs[np.isfinite(offs)]
-        least = float(np.median(offs)) if len(offs) else -np.inf
-        seconds = (samples["time_ns"] - samples["time_ns"][:1]) * NS
+        levels = pressure[before][np.isfinite(pressure[before])]
+        off_level = float(np.median(levels)) if len(levels) else -np.inf
+        seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS + 0.5 * self.noise.period
         for first, last in _suctions(phase, (samples["quality"] & BREAK) != 0):
             nozzle[first:last] = _KNOWN | _ON
             for switching in found[slice(*np.searchsorted(rows_found, (first, last)))]:
                 acts = switching.time - self.late[switching.on]
-                row = first + 1 + int(np.abs(seconds[first:last] - acts).argmin())
+                row = first + 1 + int(np.searchsorted(seconds[first:last], acts))
                 nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
             if nozzle[last - 1] & _ON:
-                off = self._by_level(samples[first:last], least)
+                off = self._off_by_level(pressure[first:last], off_level)
                 nozzle[last - off : last] = _KNOWN
         return nozzle
 
-    def _by_level(self, suction: Samples, off_level: float) -> int:
+    def _off_by_level(self, pressure: Floats, off_level: float) -> int:
         """Rows at the end of a suction for which the nozzle must be off: it fell below a level."""
-        rows = max(round(SHOWS / self.noise.period), 1)
-        pressure = suction["pressure"][-rows:].astype(np.float64)
+        pressure = pressure[-max(round(SHOWS / self.noise.period), 1) :]
         if not pressure[-1] < off_level - max(BEYOND, SIGNIFICANT * self.noise.single):
             return 0
         return int((pressure[::-1] > off_level).argmax())  # none if it was below for longer

@@ -10,8 +10,8 @@ If suction ends too soon after a switching, its knee does not show. Then the lev
 nozzle went off where the pressure fell below that at which it went off before.
 
 If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
-pressure does not show a reported switching, it is placed where the valve must have acted. In a log,
-what the whole of it shows takes the place of reports.
+pressure does not show a reported switching, it is placed where the valve must have acted. In a
+diagnosis, what the whole log shows takes the place of reports.
 """
 
 import math
@@ -472,7 +472,9 @@ def _follow_report(
         return
     nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
     acts = int(min(settings[8] if nozzle_on else settings[9], settings[7]))
-    knee = min(report_row + acts, row)
+    knee = report_row + acts
+    if knee > row:  # suction ends first
+        return
     level[knee] = state[_KNEE_LEVEL] = _level_before(pressure, knee)
     phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
