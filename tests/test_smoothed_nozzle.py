@@ -95,6 +95,16 @@ def test_a_switching_too_near_the_end_to_show_is_decided_by_level() -> None:
     assert np.abs(found - last).min() <= 4
 
 
+def test_a_nozzle_that_goes_on_just_before_suction_ends_is_seen() -> None:
+    samples = silent(rigs.recorded("gripper", 20.0, faults=("leakage=4.0",))[0])
+    finder = PhaseFinder(rigs.knees("gripper"))
+    live = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
+    knees = switched(live)
+    on = int(knees[live[knees] == Phase.SUCTION][3])
+    samples["commands"][on + 30 : on + 300] = 0
+    assert np.abs(switched(phases(samples)) - on).min() <= 3
+
+
 def test_an_ejector_that_reports_its_nozzle_needs_no_search() -> None:
     samples, _ = simulated("gripper", 20.0, small=True)
     knees = rigs.knees("gripper")

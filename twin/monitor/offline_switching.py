@@ -2,8 +2,8 @@
 
 A suction begins with the nozzle on: the pressure falls. The nozzle went off where the fall ends,
 for good or until the pressure turns again. It went on where a fall as slow as the first begins. No
-model of the system is needed, and it may have no air saving. The switching levels are similar in all
-suctions: a first pass learns them, and they decide doubtful cases in the second.
+model of the system is needed, and it may have no air saving. The switching levels are similar in
+all suctions: a first pass learns them, and they decide doubtful cases in the second.
 
 If the ejector reports its nozzle, the report says how often it switched; the pressure says when.
 """

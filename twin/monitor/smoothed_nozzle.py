@@ -25,9 +25,7 @@ from twin.signals import MS, NS, SAMPLE, Command, Phase, Reported, Samples, join
 
 PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
 LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
-ABOUT = (
-    20.0 * MS
-)  # s, between the switching that the log shows and the knee that the detector finds
+ABOUT = 20.0 * MS  # s, from the switching that the log shows to the detector's knee
 SHOWS = 40.0 * MS  # s before suction ends: a later switching does not show in the slope
 Bytes = npt.NDArray[np.uint8]
 _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
@@ -36,10 +34,11 @@ _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Knees, Bytes | None]:
     """Settings of the detector for a whole log, and bits of ``Reported`` for each of its rows.
 
-    The nozzle is not known where suction is not commanded, and where the beginning of suction is
-    missing. Without air saving there is nothing to know; an ejector that reports its nozzle needs
-    no search. A switching shows as late after the valve's action as in free runs of the model with
-    coefficients ``theta``. ``blocks`` are read once more.
+    The nozzle is not known where suction is not commanded, where the beginning of suction is
+    missing, and where it may go on again just before the end. Without air saving there is nothing
+    to know; an ejector that reports its nozzle needs no search. A switching shows as late after the
+    valve's action as in free runs of the model with coefficients ``theta``. ``blocks`` are read
+    once more.
     """
     if knees.settled == NEVER or theta[c.AIR_SAVING] == c.OFF:
         return knees, None
@@ -105,22 +104,26 @@ class _Search:
         """The bits of a piece."""
         nozzle = np.zeros(len(samples), np.uint8)
         found = switchings(samples, phase, self.noise, self.goes_off)
-        rows_found = np.array([switching.row for switching in found], np.int64)
+        shown = np.array([switching.row for switching in found], np.int64)
+        on = np.array([switching.on for switching in found], np.bool_)
+        times = np.array([switching.time - self.late[switching.on] for switching in found])
+        seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS + 0.5 * self.noise.period
+        acts = np.searchsorted(seconds, times) + 1
         unusable = (samples["quality"] & UNUSABLE) != 0
         pressure = np.where(unusable, np.nan, samples["pressure"].astype(np.float64))
-        before = np.array([switching.row - 1 for switching in found if not switching.on], np.int64)
-        levels = pressure[before][np.isfinite(pressure[before])]
+        levels = pressure[acts[~on] - 1]
+        levels = levels[np.isfinite(levels)]
         off_level = float(np.median(levels)) if len(levels) else -np.inf
-        seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS + 0.5 * self.noise.period
         for first, last in _suctions(phase, (samples["quality"] & BREAK) != 0):
             nozzle[first:last] = _KNOWN | _ON
-            for switching in found[slice(*np.searchsorted(rows_found, (first, last)))]:
-                acts = switching.time - self.late[switching.on]
-                row = first + 1 + int(np.searchsorted(seconds[first:last], acts))
-                nozzle[row:last] = _KNOWN | _ON * np.uint8(switching.on)
-            if nozzle[last - 1] & _ON:
-                off = self._off_by_level(pressure[first:last], off_level)
-                nozzle[last - off : last] = _KNOWN
+            for number in range(*np.searchsorted(shown, (first, last))):
+                row = min(max(int(acts[number]), first + 1), last)
+                nozzle[row:last] = _KNOWN | _ON * np.uint8(on[number])
+            end = slice(max(last - round(SHOWS / self.noise.period), first + 1), last)
+            if not (nozzle[end] & _ON).any():
+                nozzle[end] = 0  # it may go on again
+            elif nozzle[last - 1] & _ON:
+                nozzle[last - self._off_by_level(pressure[first:last], off_level) : last] = _KNOWN
         return nozzle
 
     def _off_by_level(self, pressure: Floats, off_level: float) -> int:
