@@ -10,8 +10,9 @@ from test_reported_nozzle import NEAR, off_by, silent, simulated, switched
 
 from twin.model.dataset import coefficients
 from twin.monitor.detector_window import knees_of
-from twin.monitor.smoothed_nozzle import _pieces, smoothed
-from twin.monitor.switching_detector import PhaseFinder
+from twin.monitor.offline_switching import noise_of
+from twin.monitor.smoothed_nozzle import _pieces, _Search, smoothed
+from twin.monitor.switching_detector import PhaseFinder, commanded
 from twin.quality import Quality
 from twin.signals import SAMPLE, Command, Phase, Reported, Samples
 
@@ -125,6 +126,13 @@ def test_a_reading_that_cannot_be_used_decides_nothing() -> None:
     samples["commands"][end : moved[0] + 400] = 0
     samples["pressure"][end - 1], samples["quality"][end - 1] = 0.0, int(Quality.BAD)
     assert nozzle(samples)[end - 1] == ON
+
+
+def test_a_valve_that_would_act_after_the_log_ends_leaves_it_whole() -> None:
+    samples = silent(simulated("gripper", 0.0, small=False)[0])
+    samples, phase, _ = commanded(samples, (0.0, 0.0))
+    early = _Search(noise_of(samples, phase), np.nan, (-1e3, -1e3))
+    assert len(early.nozzle(samples, phase)) == len(samples)
 
 
 def test_a_hold_of_a_night_is_cut() -> None:

@@ -108,7 +108,7 @@ class _Search:
         on = np.array([switching.on for switching in found], np.bool_)
         times = np.array([switching.time - self.late[switching.on] for switching in found])
         seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS + 0.5 * self.noise.period
-        acts = np.searchsorted(seconds, times) + 1
+        acts = np.minimum(np.searchsorted(seconds, times), len(samples) - 1) + 1
         unusable = (samples["quality"] & UNUSABLE) != 0
         pressure = np.where(unusable, np.nan, samples["pressure"].astype(np.float64))
         levels = pressure[acts[~on] - 1]

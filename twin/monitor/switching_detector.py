@@ -213,10 +213,8 @@ def _find(
         starts = suction and state[_AGE] < 0.0
         may_bend = suction and window > 0 and state[_AGE] >= settled + window
         same = end - row - 1
-        is_told = reported[row] & _KNOWN
-        later = max(window, int(settings[7])) if is_told else window  # rows to be known
-        least = later if may_bend else 1 if suction and is_told else 0
-        if window > 0 and same < least and end == len(commands):
+        is_told = suction and reported[row] & _KNOWN
+        if same < _rows_behind(may_bend, is_told, settings) and end == len(commands):
             return row
         if suction:
             state[_AGE] = 0.0 if starts else state[_AGE] + 1.0
@@ -233,30 +231,22 @@ def _find(
             if suction and state[_NOZZLE] > 0.0:
                 phase[row] = _SUCTION
         if suction and window > 0:
-            rows = pressure, reported[:end]
-            _search(state, rows, row, settings, may_bend, phase, level)
+            looks = may_bend and same >= window
+            _track_break(state, pressure, reported[:end], row, settings, looks, phase, level)
+            if is_told:
+                _follow_reports(state, pressure, reported, row, settings, same == 0, phase, level)
+            else:
+                _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
     return len(pressure)
 
 
-@per_row
-def _search(
-    state: _Floats,
-    rows: tuple[_Floats, _Bytes],
-    row: int,
-    settings: _Floats,
-    may_bend: bool,
-    phase: _Bytes,
-    level: _Floats,
-) -> None:
-    """Look for a knee in a row of suction; ``rows`` are pressures, and reports to its end."""
-    pressure, reported = rows
-    same = len(reported) - row - 1
-    looks = may_bend and same >= int(settings[0])
-    _track_break(state, pressure, reported, row, settings, looks, phase, level)
-    if reported[row] & _KNOWN:
-        _follow_reports(state, pressure, reported, row, settings, same == 0, phase, level)
-    else:
-        _decide_by_level(state, pressure, row, settings, may_bend and same == 0, phase)
+@compiled
+def _rows_behind(may_bend: bool, is_told: bool, settings: _Floats) -> int:
+    """Rows with the same command that must be known behind a row before it is searched."""
+    window = int(settings[0])
+    if may_bend:
+        return max(window, int(settings[7])) if is_told else window
+    return 1 if is_told and window > 0 else 0
 
 
 @per_row
