@@ -60,10 +60,12 @@ def marks(page: Page) -> list[str]:
 
 
 def loaded(page: Page) -> None:
-    """Wait until all of the range has been read."""
+    """Wait until all of the range has been read: of this one, not of a shorter one before it."""
     page.wait_for_function(
         """() => { const { curve } = past; const [from, to] = live.chart.range();
-          return curve.share === 1 && curve.time.length > 0
+          const [begin, end] = curve.range;
+          return curve.share === 1 && Math.abs(end - begin - (to - from)) < 1
+            && curve.time.length > 0
             && curve.time[0] >= from - 1 && curve.time.at(-1) <= to + 1; }"""
     )
 

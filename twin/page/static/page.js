@@ -21,7 +21,7 @@ const BACK_S = 400 * 86400; // as far as one can look back
 const FOLLOW_S = 2; // between looks at a range that ends now, at least
 const NO_CURVE = {
   time: [], measured_low: [], measured_high: [], expected_low: [], expected_high: [],
-  phases: [], gaps: [], alarms: [], share: 1, damaged: 0, logged: true, trouble: "",
+  range: [0, 0], phases: [], gaps: [], alarms: [], share: 1, damaged: 0, logged: true, trouble: "",
 };
 const QUIET = ["shelved", "suppressed", "out_of_service"];
 
@@ -664,7 +664,7 @@ const past = { // takes the place of the live curve, by the clock of the run
       curve = { ...NO_CURVE, trouble: error.message };
     }
     if (turn !== this.asked) return;
-    this.take(curve);
+    this.take({ ...curve, range: [from, to] });
     if (curve.share < 1) this.fetchSoon(20);
     else if (this.follows) this.fetchSoon(1000 * Math.max(FOLLOW_S, (to - from) / 500));
   },
