@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 from tools import battery_first
 from twin.diagnosis.answer import diagnose
 from twin.inference import unmodelled
+from twin.inference.priors import tempered
 from twin.inference.unmodelled import LEAST_SURE, SHARES, Odds
 from twin.model.effects import EFFECTS
 from twin.monitor.bins import Floats
@@ -25,7 +26,8 @@ def drawn(seed: int) -> tuple[Floats, Floats]:
 
 def odds(left: Floats, courses: Floats, effect: str = "leakage") -> Odds:
     logs = unmodelled.log_likelihoods(courses, left)[None]
-    return Odds.of(logs, EFFECTS[effect], ambient_is_measured=False)
+    cause = EFFECTS[effect]
+    return Odds.of(logs, cause, tempered(cause.frequency(ambient_is_measured=False)))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -76,7 +78,8 @@ def test_of_noise_alone_something_unlisted_is_improbable_and_of_a_course_in_it_s
     as_noise = courses * np.sqrt(RESIDUALS) / np.linalg.norm(courses)
 
     def probability(white: Floats) -> float:
-        return unmodelled.alone(unmodelled.log_likelihoods(as_noise, white)[None])
+        logs = unmodelled.log_likelihoods(as_noise, white, shares=unmodelled.SIZES)
+        return unmodelled.alone(logs[None])
 
     assert probability(left) < 0.1
     assert probability(left + 9.0 * courses @ np.ones(WAYS)) > 0.8
@@ -98,7 +101,9 @@ def test_weather_leaves_more_than_a_fault_and_comes_more_often() -> None:
     fault, weather = odds(left, large), odds(left, large, "ambient_pressure")
     assert weather.of_unlisted(1) < 0.5 < fault.of_unlisted(1)
     logs = unmodelled.log_likelihoods(large, left)[None]
-    measured = Odds.of(logs, EFFECTS["ambient_pressure"], ambient_is_measured=True)
+    cause = EFFECTS["ambient_pressure"]
+    frequency = tempered(cause.frequency(ambient_is_measured=True))
+    measured = Odds.of(logs, cause, frequency)
     assert measured.of_cause(1, 0.0) < weather.of_cause(1, 0.0)  # it is followed
 
 

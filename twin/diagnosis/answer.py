@@ -148,14 +148,13 @@ def diagnose(
     # If nothing was fitted, all cycles count as held out.
     leftover = after.leftover if hypothesis else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict = _verdict(hypothesis, before, after, leftover, strange, likely)
-    is_doubtful = all(
-        cause_odds.of_cause(len(hypothesis), rivals=0.0) < LEAST_SURE for cause_odds in odds
-    )
+    probabilities = _probabilities(evidence, searched, odds)
+    is_doubtful = all(probability < LEAST_SURE for probability in probabilities)
     listed_findings = _Findings(verdict, searched, hypothesis, after, strange, is_doubtful)
     findings = _with_unlisted(
         evidence, fitted, held_out, healthy, before, listed_findings, progress
     )
-    causes = _causes(evidence, findings.searched, odds, before) if findings.causes else []
+    causes = _causes(evidence, findings.searched, probabilities, before) if findings.causes else []
     for cause, cost in zip(causes, costs(config, evidence, findings.causes, causes), strict=False):
         if cost is not None:  # a price is configured, and a size is known
             cause["cost"] = cost
@@ -205,7 +204,7 @@ class _Findings:
     causes: Hypothesis
     after: Judged
     strange: Unlisted
-    is_doubtful: bool  # each cause is by far more likely something unlisted in its place
+    is_doubtful: bool  # each cause is by far less likely than look-alikes and something unlisted
     terms: tuple[Term, ...] = ()
     mechanism: Explained | None = None
 
@@ -457,9 +456,21 @@ def _runners_up(searched: Search) -> list[dict[str, Any]]:
 # --- causes ---------------------------------------------------------------------------------------
 
 
+def _probabilities(evidence: Evidence, searched: Search, odds: Sequence[Odds]) -> list[float]:
+    """Probability of each cause found, beside its rivals and something unlisted."""
+    if searched.found is None:
+        return []
+    found = searched.found
+    return [
+        cause_odds.of_cause(len(found.hypothesis), _weight(evidence, found, rivals))
+        for cause_odds, rivals in zip(odds, searched.rivals, strict=True)
+    ]
+
+
 def _causes(
-    evidence: Evidence, searched: Search, odds: Sequence[Odds], before: Judged
+    evidence: Evidence, searched: Search, probabilities: Sequence[float], before: Judged
 ) -> list[dict[str, Any]]:
+    """The answer's entry for each cause found, with its probability."""
     assert searched.found is not None
     best, first, result = searched.found, 0, []
     for number, cause in enumerate(best.hypothesis):
@@ -473,10 +484,7 @@ def _causes(
             "course": str(cause.course),
             "onset_s": _rounded_onset(evidence, cause),
             "parameters": values,
-            "probability": round(
-                odds[number].of_cause(len(best.hypothesis), _weight(evidence, best, rivals)),
-                3,
-            ),
+            "probability": round(probabilities[number], 3),
             "not_separable_from": [stranger(rival, best) for rival in rivals],
             "why": _why(evidence, cause, values, before),
         }

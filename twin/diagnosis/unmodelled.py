@@ -9,9 +9,11 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import white
+from twin.diagnosis.hypotheses import often
 from twin.diagnosis.residual_covariance import Weights
 from twin.diagnosis.unlisted import OVER, smooth
-from twin.inference.unmodelled import MISMATCH, Odds, alone, log_likelihoods
+from twin.inference.priors import tempered
+from twin.inference.unmodelled import MISMATCH, SHARES, SIZES, Odds, alone, log_likelihoods
 from twin.model.effects import effect_of
 from twin.monitor.bins import Floats
 
@@ -62,12 +64,9 @@ class Unmodelled:
         """
         explained = (self._off[:, 1 + number] - self._off[:, 0])[:, None]
         white = [self.weights.white(course * explained) for course in self._courses]
-        cause = effect_of(self.found[number].effect)
-        return Odds.of(
-            self._log_likelihoods(white),
-            cause,
-            ambient_is_measured="ambient" in self.evidence.told,
-        )
+        cause = self.found[number]
+        frequency = tempered(often(self.evidence, cause))
+        return Odds.of(self._log_likelihoods(white), effect_of(cause.effect), frequency)
 
     def alone(self) -> float:
         """Probability that something unlisted acts if no cause was found.
@@ -76,13 +75,12 @@ class Unmodelled:
         """
         white = [self.weights.white(course) for course in self._courses]
         noise = math.sqrt(len(self._residual))
-        return alone(
-            self._log_likelihoods(
-                [courses * (noise / np.linalg.norm(courses)) for courses in white]
-            )
-        )
+        as_noise = [courses * (noise / np.linalg.norm(courses)) for courses in white]
+        return alone(self._log_likelihoods(as_noise, SIZES))
 
-    def _log_likelihoods(self, white: Sequence[Floats]) -> Floats:
-        """Of each set of whitened courses, with each share of them left."""
+    def _log_likelihoods(self, white: Sequence[Floats], shares: Floats = SHARES) -> Floats:
+        """Of each set of whitened courses, with each of ``shares`` of them left."""
         scale = max(float(np.mean(self._residual**2)), 1.0)
-        return np.array([log_likelihoods(courses, self._residual, scale) for courses in white])
+        return np.array(
+            [log_likelihoods(courses, self._residual, scale, shares) for courses in white]
+        )

@@ -9,12 +9,13 @@ from twin.model.effects import Effect
 PRIOR_TEMPER = 1.0 / 3.0
 
 
-def tempered(effect: Effect, *, ambient_is_measured: bool) -> float:
-    """Prior frequency of an effect over that of wear, as far as it counts in a probability."""
-    return math.pow(effect.frequency(ambient_is_measured=ambient_is_measured), PRIOR_TEMPER)
+def tempered(frequency: float) -> float:
+    """A prior frequency, over that of wear, as far as it counts in a probability."""
+    return math.pow(frequency, PRIOR_TEMPER)
 
 
 def penalty(effect: Effect, size: float, *, ambient_is_measured: bool) -> float:
     """Prior penalty (chi-square) of an effect in ``size`` (in typical ones), beside wear."""
     of_size = size**2 if effect.is_weather else 0.0
-    return of_size - 2.0 * math.log(tempered(effect, ambient_is_measured=ambient_is_measured))
+    frequency = effect.frequency(ambient_is_measured=ambient_is_measured)
+    return of_size - 2.0 * math.log(tempered(frequency))

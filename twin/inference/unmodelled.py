@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.inference.priors import tempered
 from twin.inference.whitening import Floats
 from twin.model.effects import Effect
 
@@ -23,15 +22,33 @@ MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # has 0.15: of 85 causes where more was left, 53 act (tools.reliability), 0.15 to 0.1 says 0.6.
 UNLISTED, BESIDE, FURTHER = 0.1, 0.15, 0.3
 SHARES = np.geomspace(0.003, 1.0, 9)  # of what was explained, that may be left of it
-_EDGES = np.concatenate([[0.0], np.sqrt(SHARES[1:] * SHARES[:-1]), [1.0]])
-_ANY = np.diff(_EDGES)  # of an effect that nobody listed all shares are as probable
-_LITTLE = _ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2)  # of one that is: as its waveform is off
-_LITTLE /= _LITTLE.sum()
+SIZES = np.geomspace(0.003, 30.0, 13)  # of the noise, that something may have where no cause acts
+SMALLEST = 0.1  # of the noise, that something unlisted has: less would be part of the noise
+
+
+def _widths(values: Floats) -> Floats:
+    """Width of the interval about each of ``values``, which grow by the same factor."""
+    edges = np.concatenate([[0.0], np.sqrt(values[1:] * values[:-1]), values[-1:]])
+    widths: Floats = np.diff(edges)
+    return widths
+
+
+def _distribution(weights: Floats) -> Floats:
+    shares: Floats = weights / weights.sum()
+    return shares
+
+
+_ANY = _widths(SHARES)  # of an effect that nobody listed all shares are as probable
+# Of one that is listed little is left: as its waveform is off.
+_LITTLE = _distribution(_ANY * np.exp(-0.5 * (SHARES / MISMATCH) ** 2))
+# Weather acts on everything: Student's t with 2 degrees of freedom, as no law is quite the rig's.
+_WEATHER = _distribution(_ANY * (2.0 + (SHARES / MISMATCH) ** 2) ** -1.5)
 # Beside healthy cycles of another record a twin is off as well; by much on some rigs, as its
-# equations are not theirs: Student's t with 2 degrees of freedom, on 16 records of rigs from
-# another world.
-_TWIN = _ANY * (2.0 + (SHARES / MISMATCH) ** 2) ** -1.5
-_TWIN /= _TWIN.sum()
+# equations are not theirs. On 36 records of 18 rigs from another world a Cauchy distribution of
+# this width is the likeliest of Student's; a normal one of any width is exp(4) times less likely.
+_TWIN = _distribution(_widths(SIZES) / (1.0 + (SIZES / MISMATCH) ** 2))
+# Something unlisted is as often between one and two times the noise as between ten and twenty.
+_UNLISTED = _distribution(np.where(SIZES >= SMALLEST, 1.0, 0.0))
 MOST_SURE = 0.99  # nobody knows the whole table, nor all that may not be in it
 LEAST_SURE = 0.2  # a name that is right less than once in five is none. Chosen
 MOST = 1e9  # beyond it nothing changes any more
@@ -49,15 +66,12 @@ class Odds:
     frequency: float = 1.0
 
     @classmethod
-    def of(cls, log_likelihoods: Floats, cause: Effect, *, ambient_is_measured: bool) -> "Odds":
+    def of(cls, log_likelihoods: Floats, cause: Effect, frequency: float) -> "Odds":
         """From the log likelihoods with each of SHARES left beside a cause, (·, shares).
 
-        Courses are averaged. Weather acts on everything, and no model's laws are quite those of the
-        rig: it leaves as much as a twin leaves on another day.
+        Courses are averaged. ``frequency`` is the cause's tempered prior one.
         """
-        expected = _TWIN if cause.is_weather else _LITTLE
-        frequency = tempered(cause, ambient_is_measured=ambient_is_measured)
-        return cls(_ratio(log_likelihoods, expected), frequency)
+        return cls(_ratio(log_likelihoods, _WEATHER if cause.is_weather else _LITTLE), frequency)
 
     def of_cause(self, causes: int, rivals: float) -> float:
         """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it."""
@@ -86,27 +100,29 @@ class Odds:
 def alone(log_likelihoods: Floats) -> float:
     """Probability that something unlisted acts where no listed effect does.
 
-    ``log_likelihoods`` are those with each of SHARES of the noise left, (·, shares).
+    ``log_likelihoods`` are those with each of SIZES of the noise left, (·, sizes).
     """
-    strange = UNLISTED * _ratio(log_likelihoods, _TWIN)
+    strange = UNLISTED * _ratio(log_likelihoods, _TWIN, _UNLISTED)
     return min(strange / (1.0 + strange), MOST_SURE)
 
 
-def _ratio(log_likelihoods: Floats, expected: Floats) -> float:
-    """Likelihood of any share beside that of the shares that are ``expected``, at most MOST."""
+def _ratio(log_likelihoods: Floats, expected: Floats, unlisted: Floats = _ANY) -> float:
+    """Likelihood of shares as something unlisted leaves, beside the ``expected``; at most MOST."""
     likelihoods = np.exp(log_likelihoods - log_likelihoods.max()).mean(axis=0)
-    usual, unlisted = float(likelihoods @ expected), float(likelihoods @ _ANY)
-    return unlisted / max(usual, unlisted / MOST)
+    usual, strange = float(likelihoods @ expected), float(likelihoods @ unlisted)
+    return strange / max(usual, strange / MOST)
 
 
-def log_likelihoods(courses: Floats, left: Floats, scale: float = 1.0) -> Floats:
-    """With each of SHARES left in smooth ``courses``, less that with none; all are whitened.
+def log_likelihoods(
+    courses: Floats, left: Floats, scale: float = 1.0, shares: Floats = SHARES
+) -> Floats:
+    """With each of ``shares`` left in smooth ``courses``, less that with none; all are whitened.
 
     Each course is as large as what is explained in its place, and is left with a normal size.
     ``scale`` is the variance of what is ``left``.
     """
     directions, sizes, _ = np.linalg.svd(courses, full_matrices=False)
-    variance = SHARES[:, None] ** 2 * sizes**2 / scale
+    variance = shares[:, None] ** 2 * sizes**2 / scale
     power = (directions.T @ left) ** 2 / scale
     logs: Floats = 0.5 * (power * variance / (1.0 + variance) - np.log1p(variance)).sum(axis=1)
     return logs

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from twin.inference.gauss_newton import Descent, descend
-from twin.inference.priors import penalty
+from twin.inference.priors import penalty, tempered
 from twin.inference.sensitivities import coefficients_at, derivatives
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH, Odds, hats, knots_over, log_likelihoods
 from twin.inference.whitening import Covariance, fading, low_rank
@@ -142,7 +142,8 @@ def listed_share(
         courses.append(hats(time, knots_over(time[here])) * (here * moves)[:, None])
     white = known.white(np.column_stack([off - moves, *courses]))
     logs = log_likelihoods(white[:, 1:], white[:, 0])[None]
-    return Odds.of(logs, cause, ambient_is_measured=ambient_is_measured).of_cause(1, 0.0)
+    frequency = tempered(cause.frequency(ambient_is_measured=ambient_is_measured))
+    return Odds.of(logs, cause, frequency).of_cause(1, 0.0)
 
 
 @dataclass(frozen=True)
