@@ -178,6 +178,24 @@ def test_a_deviation_is_the_alarm_of_its_cause_with_what_to_do() -> None:
     assert stream.state(LEAK) is State.RETURNED
 
 
+def test_a_cost_goes_with_its_cause_and_not_with_the_next() -> None:
+    stream = Stream()
+    stream.at(5, deviation(5))
+    costly, later = (
+        diagnosis(at, 5, cause) for at, cause in ((9, "leakage"), (11, "suction_loss"))
+    )
+    for found in (costly, later):
+        found.data["answer"]["causes"][0]["parameters"] = {}
+    costly.data["answer"]["causes"][0]["cost"] = {"currency": "€"}
+    stream.at(9, costly)
+    (episode,) = stream.desk.news.episodes.values()
+    assert episode.evidence["cost"] == {"currency": "€"}
+    stream.at(11, later)
+    (episode,) = stream.desk.news.episodes.values()
+    assert episode.alarm == "deviation_suction_loss"
+    assert "cost" not in episode.evidence
+
+
 def test_the_diagnosis_renames_it_and_other_causes_have_their_own() -> None:
     stream = Stream()
     stream.at(5, deviation(5), cycle(5))

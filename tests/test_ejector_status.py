@@ -137,3 +137,36 @@ def test_evidence_of_a_diagnosis_is_told_in_the_readers_language() -> None:
 def test_evidence_that_is_english_says_so(words: str, label: str, text: str) -> None:
     with speaking(language_of("de", "language")):
         assert list(facts({"words": words})) == [(label, text)]
+
+
+COSTLY = DIAGNOSED | {
+    "cost": {
+        "air_nl_per_cycle": {"value": 0.5, "low95": 0.4, "high95": 0.6},
+        "money_per_year": {"value": 145.2, "low95": 110.0, "high95": 1180.0},
+        "currency": "€",
+        "cycles_per_year": 4_000_000,
+        "operating_hours": 4000.0,
+        "differs_from_zero": True,
+    }
+}
+
+
+@pytest.mark.parametrize(
+    ("code", "label", "text"),
+    [
+        ("en", "cost", "this leakage costs about 145 € a year (95 %: 110 to 1180), 4000 h of"),
+        ("de", "Kosten", "Leckage kostet etwa 145 € im Jahr (95 %: 110 bis 1180), 4000"),
+    ],
+)
+def test_the_card_and_the_history_say_what_the_cause_costs(
+    code: str, label: str, text: str
+) -> None:
+    one = board(a=Priority.HIGH)
+    one.resume({"a": Kept(True, False)})
+    episode = Episode("a", 10, evidence=COSTLY)
+    with speaking(language_of(code, "language")):
+        (card,) = alarm_cards(one, [episode], [], 20)
+        history = episode_details(episode, "a", 20)
+        assert dict(card["facts"])[label].startswith(text)
+        assert history["facts"] == card["facts"]
+        assert label not in dict(facts(DIAGNOSED))

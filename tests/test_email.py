@@ -177,6 +177,32 @@ def test_a_diagnosed_cause_says_how_sure() -> None:
     assert "How sure: diagnosed: 93 %; this log cannot tell it from" in letter.text
 
 
+@pytest.mark.parametrize(
+    ("code", "line"),
+    [
+        ("en", "Cost: this suction loss costs about 38 € a year (95 %: 34 to 41), 4000 h of"),
+        ("de", "Kosten: Saugleistungsverlust kostet etwa 38 € im Jahr (95 %: 34 bis 41), 4000 "),
+    ],
+)
+def test_a_diagnosed_cause_says_what_it_costs(code: str, line: str) -> None:
+    """The cost goes from the diagnosis into the message that all outlets send, and the mail."""
+    stream = leak()
+    found = diagnosis(9, 5, "suction_loss")
+    cost = {
+        "money_per_year": {"value": 38.0, "low95": 34.0, "high95": 41.0},
+        "currency": "€",
+        "operating_hours": 4000.0,
+        "differs_from_zero": True,
+    }
+    found.data["answer"]["causes"][0] |= {"cost": cost, "not_separable_from": []}
+    stream.at(9, found)
+    document = json.loads([*of_event(UNIT, stream.said[-1])][-1].body)
+    assert document["evidence"]["cost"] == cost
+    mail = {"name": "Ann", "address": ANN, "time_zone": "", "reason": "raised", "count": 1}
+    write = writer(board_rules(None), Catalogues().languages[code])
+    assert line in write({**mail, "document": document}).text
+
+
 def test_an_alarm_whose_rule_is_gone_is_told_in_its_own_words() -> None:
     document = json.loads(next(of_event(UNIT, leak().said[0])).body)
     mail = {"name": "Ann", "address": ANN, "time_zone": "", "reason": "raised", "count": 1}

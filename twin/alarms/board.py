@@ -167,9 +167,15 @@ class Diary:
 
 
 def merge_evidence(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
-    """Evidence updated by later evidence; the first cycle and the first guess stay."""
+    """Evidence updated by later evidence; the first cycle and the first guess stay.
+
+    A cost goes with the sizes that it belongs to.
+    """
     first_values = {key: earlier[key] for key in ("first_cycle", "guess") if key in earlier}
-    return {**earlier, **later, **first_values}
+    merged = {**earlier, **later, **first_values}
+    if "parameters" in later and "cost" not in later:
+        merged.pop("cost", None)
+    return merged
 
 
 def _after_change(episode: Episode, change: Change) -> Episode:

@@ -251,7 +251,7 @@ class Alarms:
             entry = _cause_evidence(details, answer) | {"words": event.text}
             entry |= {"report": event.data["report"]} if "report" in event.data else {}
             if cause == main_cause:
-                entry = self._evidence.get(value_of(former), {}) | entry
+                entry = merge_evidence(self._evidence.get(value_of(former), {}), entry)
             self._note(value_of(cause), entry)
         events = []
         if main_cause != former:
@@ -335,8 +335,8 @@ def _received(samples: Samples, time_ns: int, else_ns: int) -> int:
 
 
 def _cause_evidence(cause: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
-    """The evidence that a diagnosis gives for one cause, with what tells when it acts."""
-    keys = ["effect", "course", "parameters", "probability", "not_separable_from"]
+    """The evidence that a diagnosis gives for one cause, with its cost and when it acts."""
+    keys = ["effect", "course", "parameters", "probability", "not_separable_from", "cost"]
     keys += ["onset_s", "onset_low95_s", "onset_high95_s", "cycles", "share_pct"]
     entry = {key: cause[key] for key in keys if key in cause}
     log = answer.get("cycles", {})

@@ -14,7 +14,17 @@ from twin.alarms.requests import Request
 from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import Alarm, State
 from twin.diagnosis.retelling import retold
-from twin.diagnosis.text import Times, capital, certainty, ends, number, plain_words, spoken, when
+from twin.diagnosis.text import (
+    Times,
+    capital,
+    certainty,
+    cost,
+    ends,
+    number,
+    plain_words,
+    spoken,
+    when,
+)
 from twin.figures.key_figures import NO_DASH
 from twin.instants import instant, lasting
 from twin.languages.texts import ENGLISH, language_code, numeral, tr
@@ -219,6 +229,8 @@ def facts(evidence: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     if sizes:
         yield tr("size"), "; ".join(_size(parameter) for parameter in sizes)
     yield from ((tr("how sure"), text) for text in _sureness(evidence))
+    if "cost" in evidence:
+        yield tr("cost"), cost(evidence)
     if measured := _measured(evidence):
         yield tr("measured"), measured
     if "log_begin_ns" in evidence and "course" in evidence:
