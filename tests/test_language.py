@@ -5,6 +5,7 @@ syllables of a word (Flesch, "A new readability yardstick", 1948). From 60 on a 
 English. A page of short, odd sentences scores well too: hence the phrases.
 """
 
+import ast
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -33,8 +34,11 @@ BANNED = {
     r"\bwhat else goes\b": "other data",
     r"\bhow they go together\b": "how they fit together",
     r"\bgoes as one before\b": "is like an earlier one",
-    r"\bwhat speaks for it\b": "evidence",
+    r"\bsp(eaks|oke) for\b": "evidence",
+    r"\blet it speak\b": "unshelve",
     r"\bnothing waits\b": "the queue is empty",
+    r"\bnobody took\b": "say what is lost, and why",
+    r"\bke(eps?|pt)\b[^.]{0,20}\bquiet\b": "shelved, suppressed, out of service or not announced",
     r"\bas wide as needed\b": "say how wide, and why",
     r"\bnot told of\b": "unknown or missing, and in how many",
     r"\bso many of them\b": "say how many",
@@ -106,6 +110,20 @@ def messages() -> Iterator[str]:
             yield str(message.id)
 
 
+def said() -> Iterator[tuple[str, str]]:
+    """Place and text of every string in the programs, docstrings and comments left out.
+
+    Docstrings of commands are their help, and checked there.
+    """
+    for path in sorted([*(ROOT / "twin").rglob("*.py"), *(ROOT / "drivers").rglob("*.py")]):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        described = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in nodes:
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                if id(node) not in described:
+                    yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
+
+
 def banned(text: str) -> list[str]:
     """What a text says that nobody understands at once, with what to write."""
     plain = " ".join(text.split())
@@ -134,6 +152,12 @@ def test_a_help_text_has_no_riddle(name: str, text: str) -> None:
 
 def test_no_message_is_a_riddle() -> None:
     assert not [found for message in messages() for found in banned(message)]
+
+
+def test_no_string_of_the_programs_is_a_riddle() -> None:
+    strings = list(said())
+    assert len(strings) > 10_000  # it looks at them
+    assert not [(place, found) for place, text in strings for found in banned(text)]
 
 
 def test_the_check_finds_what_it_is_for() -> None:

@@ -181,7 +181,7 @@ def test_what_is_refused_is_set_aside_with_why(outbox: Outbox) -> None:
 
 def test_people_see_what_waits_and_send_again_what_was_refused(run: Any, tmp_path: Path) -> None:  # noqa: F811
     begun(tmp_path / "alarms.sqlite").close()
-    assert run("outbox") == "nothing waits\n"
+    assert run("outbox") == "the outbox is empty\n"
     with open_outbox(tmp_path / "alarms.sqlite", UNIT) as outbox:
         outbox.put([("webhook", message(n)) for n in (1, 2)])
         outbox.refuse("webhook", "1", "status 400")

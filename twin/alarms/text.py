@@ -15,9 +15,9 @@ STATES = {
     State.UNACKNOWLEDGED: "active, and nobody has acknowledged it",
     State.ACKNOWLEDGED: "active; somebody has acknowledged it and takes care",
     State.RETURNED: "not active any more, and nobody has acknowledged it",
-    State.SHELVED: "a person keeps it quiet for a time; then it speaks again by itself",
-    State.SUPPRESSED: "quiet by design, while an alarm of `suppressed_by` is active",
-    State.OUT_OF_SERVICE: "a person keeps it quiet until it is taken into service again",
+    State.SHELVED: "a person keeps it from being announced, for a time",
+    State.SUPPRESSED: "not announced by design, while an alarm of `suppressed_by` is active",
+    State.OUT_OF_SERVICE: "a person keeps it from being announced, until it is in service again",
 }
 SUPPRESSIONS = (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
 _DEED_WORDS = {
@@ -92,7 +92,7 @@ def _deed(change: Change, alarm: Alarm) -> str:
     if change.deed is Deed.SHELVED and alarm.shelved_until is not None:
         return f"{sentence} for {(alarm.shelved_until - change.time_ns) / SECOND_NS / 60:.3g} min"
     if change.deed is Deed.RAISED and not change.announced:
-        return f"{sentence}, and kept quiet: {str(alarm.state).replace('_', ' ')}"
+        return f"{sentence}, not announced: {str(alarm.state).replace('_', ' ')}"
     return sentence
 
 

@@ -54,7 +54,7 @@ Who = Annotated[str, typer.Option("--by", metavar="NAME", help="Instead of the u
 def list_(
     configs: ConfigFiles = None, unit: UnitId = "", alarms: Url = "", json_file: JsonAlone = None
 ) -> None:
-    """What a person is to look at, the most urgent first; then what is kept quiet.
+    """Standing alarms, the most urgent first; then shelved, suppressed and out-of-service ones.
 
     Several configurations are as many ejectors, one after the other.
     """
@@ -91,7 +91,7 @@ def history(
     ] = None,
     json_file: JsonAlone = None,
 ) -> None:
-    """Every time an alarm was active: since when, how long, who acknowledged it, what spoke for it.
+    """Every episode of an alarm: since when, how long, who acknowledged it, its evidence.
 
     The newest comes last.
     """
@@ -214,7 +214,7 @@ def export(
 def acknowledge(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
-    """Say that somebody has seen an alarm."""
+    """Acknowledge an alarm: somebody has seen it and takes care."""
     from twin.alarms.state import Deed
 
     _ask(names, Deed.ACKNOWLEDGED, by, _Selection(config, unit, alarms))
@@ -231,7 +231,7 @@ def shelve(
     alarms: Url = "",
     by: Who = "",
 ) -> None:
-    """Keep an alarm quiet for a time."""
+    """Shelve an alarm: do not announce it for a time."""
     from twin.alarms.state import Deed
 
     _ask(names, Deed.SHELVED, by, _Selection(config, unit, alarms), hours * 3600.0)
@@ -241,7 +241,7 @@ def shelve(
 def unshelve(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
-    """Let it speak before that time is over."""
+    """End the shelving of an alarm before its time is over."""
     from twin.alarms.state import Deed
 
     _ask(names, Deed.UNSHELVED, by, _Selection(config, unit, alarms))
@@ -251,7 +251,7 @@ def unshelve(
 def out_of_service(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
-    """Keep an alarm quiet until it is taken into service again."""
+    """Take an alarm out of service: do not announce it until ``in-service``."""
     from twin.alarms.state import Deed
 
     _ask(names, Deed.OUT_OF_SERVICE, by, _Selection(config, unit, alarms))
@@ -261,7 +261,7 @@ def out_of_service(
 def in_service(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
-    """Take an alarm into service again."""
+    """Put an alarm back into service."""
     from twin.alarms.state import Deed
 
     _ask(names, Deed.IN_SERVICE, by, _Selection(config, unit, alarms))
@@ -276,7 +276,7 @@ def outbox(
         bool, typer.Option("--again", help="Send once more what was refused, when a run is there.")
     ] = False,
 ) -> None:
-    """What waits to be told to the outside, and what was refused there."""
+    """Messages about alarms that are still to be sent, and those that were refused."""
     from twin.alarms.database_url import place_of
     from twin.notifications.outbox import open_outbox
 
@@ -291,7 +291,7 @@ def outbox(
             for message, reason in refused:
                 print(f"        {message.alarm}  {message.id}  {reason}")
         if not box.destinations():
-            print("nothing waits")
+            print("the outbox is empty")
 
 
 @alarms_app.command()

@@ -77,7 +77,7 @@ def printers() -> Iterator[tuple[Printer, Callable[[str], None]]]:
         yield printer, lambda text: talk.say(f"twin: {text}\n")
     finally:
         if unread := printer.close():
-            talk.say(f"twin: nobody took what was said last, in {unread} parts\n")
+            talk.say(f"twin: output lost: {unread} pieces of text were not read in time\n")
         talk.close()
 
 
