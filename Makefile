@@ -17,7 +17,7 @@ demo: .venv/run  ## a simulated PLC, a live twin beside it, a leak that opens ha
 test: .venv/dev  ## the whole test suite
 	$(PYTEST)
 
-short: .venv/dev  ## the tests that are not marked slow, in ten minutes
+short: .venv/dev  ## the tests that are not marked slow, in some ten minutes
 	$(PYTEST) -m "not slow"
 
 # What the tests speak to, if it is there: a broker, a browser, PLCs of other make.

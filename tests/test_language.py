@@ -119,9 +119,8 @@ def said() -> Iterator[tuple[str, str]]:
         nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
         described = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
         for node in nodes:
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                if id(node) not in described:
-                    yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
+            if isinstance(node, ast.Constant) and id(node) not in described:
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", str(node.value)
 
 
 def banned(text: str) -> list[str]:

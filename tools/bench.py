@@ -159,7 +159,9 @@ BENCHMARKS = (
         "through calls of 1 to 50 rows, 10 000 in all, of one hypothesis.",
         (
             Figure("model: one row of 1 ms", "ns", "the same in C, -O2", 1.25, limits_ratio=True),
-            Figure("model: one row as the twin goes, in strides", "ns", "row by row in C, -O2"),
+            Figure(
+                "model: one row with dense output, as in the twin", "ns", "row by row in C, -O2"
+            ),
             Figure(
                 "model: one row for each of 64 hypotheses",
                 "ns",

@@ -1,4 +1,4 @@
-"""The twin's own part of a configuration: the asset, its data set, and the settings of alarms.
+"""The twin's own part of a configuration: the asset, its data set and its log.
 
 The data set has layers; each overrides the one before: the defaults; the object-specific data set
 of the type in the asset database; ``[data]``; the instance-specific data set of the unit in the

@@ -15,8 +15,7 @@ from benchmarks.figures import Line, Measured, Run, medians
 from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.native import PLAIN, library
 from benchmarks.recording import Recording, hour
-from twin.model import dense_solver as strides
-from twin.model import kernel
+from twin.model import dense_solver, kernel
 from twin.model.effects import EFFECTS, Effect, apply
 from twin.model.theta import Theta
 from twin.monitor.rows import time_steps
@@ -56,10 +55,10 @@ def speed(run: Run) -> Sequence[Measured]:
         single = _one(theta, single_rows, native)
         run.tell(f"kernel: {HYPOTHESES} hypotheses")
         together = _many(bank, bank_rows, native, vectors)
-        run.tell("kernel: strides, and calls of few rows")
+        run.tell("kernel: dense output, and calls of few rows")
         return (
             single,
-            _strided(theta, single_rows, native),
+            _dense(theta, single_rows, native),
             *together,
             _calls(theta, first_rows(hour(), CUT_ROWS)),
         )
@@ -93,19 +92,21 @@ def _one(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
     return Measured(ours, c, note)
 
 
-def _strided(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
+def _dense(theta: Theta, driven: Driven, native: Advance | None) -> Measured:
     """One hypothesis with dense output, as in the twin, beside the C that goes row by row."""
-    expected, row_by_row = (timed(way, theta, driven)[1] for way in (_in_strides, kernel.advance))
+    expected, row_by_row = (
+        timed(way, theta, driven)[1] for way in (_with_dense_output, kernel.advance)
+    )
     note = f"within {np.nanmax(np.abs(expected - row_by_row)):.1g} Pa of the kernel's"
     ours, c = [], []
     for _ in range(REPEATS):
-        ours.append(timed(_in_strides, theta, driven)[0])
+        ours.append(timed(_with_dense_output, theta, driven)[0])
         c += [timed(native, theta, driven)[0]] if native else []
     return Measured(ours, c, note)
 
 
-def _in_strides(_: Floats, *given: Any) -> None:
-    strides.advance(strides.DenseSolver(), *given)
+def _with_dense_output(_: Floats, *given: Any) -> None:
+    dense_solver.advance(dense_solver.DenseSolver(), *given)
 
 
 def _many(

@@ -1,11 +1,11 @@
 """Which cause it is, while the loop runs: probabilities of every effect, and of none, per cycle.
 
-That anything differs is judged by sums over cycles (``change``). Which effect it is, by the mean of
-the cycles since it began, less what was usual before: each suspect is fitted to it alone, and its
-likelihood tells how probable it is. The first of these cycles is left out: the change may have
-begun inside of it, and a part of one effect looks like the whole of another. Cycle-to-cycle scatter
-averages out of that mean; what the model has wrong about a signature does not, so a share of what
-is explained counts as error.
+That anything differs is judged by sums over cycles (``change_detection``). Which effect it is, by
+the mean of the cycles since it began, less what was usual before: each suspect is fitted to it
+alone, and its likelihood tells how probable it is. The first of these cycles is left out: the
+change may have begun inside of it, and a part of one effect looks like the whole of another.
+Cycle-to-cycle scatter averages out of that mean; what the model has wrong about a signature does
+not, so a share of what is explained counts as error.
 """
 
 import math

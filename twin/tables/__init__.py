@@ -1,1 +1,1 @@
-"""Tables of other programs: CSV and Parquet in and out."""
+"""Tables of other programs: CSV, Parquet and Excel in; CSV and Parquet out."""
