@@ -5,12 +5,16 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import rigs
 from command_line import twin
+from test_catalogue import LIP, proposal
 from typer.main import get_command
 
+from twin.assets import provenance
 from twin.cli.main import app
 from twin.cli.options import ALL_ENDINGS, chosen, written_as
 from twin.errors import ConfigError
@@ -129,14 +133,67 @@ def test_assets_go_out_as_the_ending_says(tmp_path: Path, monkeypatch: pytest.Mo
 # Progress.
 
 
-def test_an_export_shows_how_far_it_is(log: Path, tmp_path: Path, seen: Callable[..., str]) -> None:
-    assert "exporting (samples)" in seen("export", log, "-o", tmp_path / "rows.csv")
+LONG = {
+    "export LOG -o rows.csv": "exporting (samples)",
+    "compare LOG LOG": "reading good.mcap (samples)",
+    "log check LOG": "checking (samples)",
+    "log recover LOG -o whole.mcap": "recovering (samples)",
+    "figures show LOG": "reading off the curve (samples)",
+    "figures costs LOG": "key figures of good.mcap",
+    "figures savings LOG": "predicting other settings",
+    "export-fmu --config CONFIG --sources-only": "translating the model to C",
+    "effects add LIP --assets DATABASE": "searching for a lip",
+}
 
 
-def test_a_comparison_shows_what_it_reads(log: Path, seen: Callable[..., str]) -> None:
-    text = seen("compare", log, log)
-    assert "reading good.mcap (samples)" in text
-    assert "comparing" in text
+@pytest.fixture
+def long_command(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], list[str]]:
+    """Fill in the files of a command; the diagnosis of ``effects add`` is a stand-in."""
+
+    def diagnose(*given: Any) -> SimpleNamespace:
+        progress = given[-1]
+        progress("searching for a lip")
+        return SimpleNamespace(json={"verdict": "unlisted", "causes": [{"effect": "lifting_lip"}]})
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("twin.diagnosis.propose.diagnose", diagnose)
+    test = {"log": str(log), "log_sha256": provenance.of_log(log)["log_sha256"]}
+    found_in = {"data_set": rigs.config("gripper").data.hash}
+    files = {
+        "LOG": log,
+        "CONFIG": rigs.path_of("gripper"),
+        "LIP": proposal(tmp_path, test=test, effect=LIP | {"found_in": found_in}),
+        "DATABASE": f"sqlite:///{tmp_path / 'assets.sqlite'}",
+    }
+    return lambda command: [str(files.get(word, word)) for word in command.split()]
+
+
+@pytest.mark.parametrize(("command", "shown"), LONG.items(), ids=LONG)
+def test_a_long_command_shows_progress_on_a_terminal_alone(
+    command: str,
+    shown: str,
+    long_command: Callable[[str], list[str]],
+    seen: Callable[..., str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert shown in seen(*long_command(command))
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(("command", "shown"), LONG.items(), ids=LONG)
+def test_a_long_command_shows_no_progress_in_a_pipe(
+    command: str,
+    shown: str,
+    long_command: Callable[[str], list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, *long_command(command)) == 0
+    out, err = capfd.readouterr()
+    assert shown not in out + err
+    assert "\x1b" not in out + err
 
 
 def test_the_paper_shows_its_steps(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import App, read_config, say_if_new
+from twin.cli.console import status
 from twin.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
@@ -118,7 +119,9 @@ def _test(proposal: "Proposal", file: Path, log: Path | None, assets: str) -> No
     ):  # it was found beside another
         settings = Config.of_recorded(recorded.header, str(path), assets=assets, unit=proposal.unit)
     print(f"testing on {path}", file=sys.stderr)
-    if reason := named_on(proposal, settings, recorded, str(path)):
+    with status() as say:
+        reason = named_on(proposal, settings, recorded, str(path), say)
+    if reason:
         raise ConfigError(
             f"{file}: with it in the catalogue, a diagnosis of {path} does not name it: {reason}",
             "widen low and high of its parameters, or take it without its test: --untested",

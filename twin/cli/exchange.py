@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from twin.cli.console import status
 from twin.cli.options import FMU, SSP
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError, known_names
@@ -66,9 +67,11 @@ def export_fmu(
     name = settings.asset.id or settings.asset.type
     program = f"ejector-twin {version('ejector-twin')}"
     component = Component.of(settings.data, vessel.value)
-    fmu = make_fmu(
-        component, name, settings.origin, program, int(fmi.value), compiled=not sources_only
-    )
+    with status() as say:
+        say("translating the model to C" + ("" if sources_only else " and compiling it"))
+        fmu = make_fmu(
+            component, name, settings.origin, program, int(fmi.value), compiled=not sources_only
+        )
     target = output or Path(fmu.name)
     content = fmu.content
     if target.suffix.lower() == SSP:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import App, chosen_unit, not_negative, read_config, say_if_cut
+from twin.cli.console import rows_progress, status
 from twin.cli.options import (
     JSON,
     PICTURES,
@@ -71,7 +72,6 @@ def show(
     from twin.assets.unit import Unit
     from twin.figures.curve import stretches, volume_of
     from twin.figures.database import open_store
-    from twin.figures.read import of_log
     from twin.figures.text import curve_plain, curve_table, cycles_table
     from twin.log.reader import open_log
 
@@ -85,10 +85,11 @@ def show(
     recorded = open_log(log)
     say_if_cut(recorded, log, "used")
     settings = _of_log(recorded, log, config)
-    plain = [cycle for _, cycle in of_log(recorded, key_figures_of(settings))]
+    plain = [cycle for _, cycle in _read(recorded, settings)]
     if recorded.header.derived:  # timings of derived commands are unknown, and so are expectations
         plain = [{k: v for k, v in cycle.items() if not k.endswith("_expected")} for cycle in plain]
-    suctions = list(stretches((rows for rows, _ in recorded.blocks()), volume_of(settings)))
+    blocks = rows_progress(recorded.blocks(), "reading off the curve")
+    suctions = list(stretches((rows for rows, _ in blocks), volume_of(settings)))
     if recorded.header.derived:
         print(f"twin: {recorded.header.derived}", file=sys.stderr)
     print(cycles_table(plain), curve_table(suctions), sep="\n\n")
@@ -131,7 +132,7 @@ def costs(
     if table is not None:
         refuse_existing(table, force=force)
     recorded, settings = _opened(log, config, unit)
-    tariff, cycles = _tariff(settings), _cycles(recorded, settings)
+    tariff, cycles = _tariff(settings), [cycle for cycle, _ in _read(recorded, settings)]
     if recorded.header.derived:
         print(f"twin: {recorded.header.derived}", file=sys.stderr)
     by_day, whole = days(cycles), year(cycles, tariff)
@@ -163,7 +164,8 @@ def savings(
     require_writable(json_file)
     recorded, settings = _opened(log, config, unit)
     recorded.header.require_commands(str(log))
-    cycles = spread(whole_cycles(recorded.blocks()), MOST_CYCLES)
+    blocks = rows_progress(recorded.blocks(), f"reading {log.name}")
+    cycles = spread(whole_cycles(blocks), MOST_CYCLES)
     if not cycles:
         raise ConfigError(
             f"{log}: no complete cycle, so no program to predict for",
@@ -172,9 +174,11 @@ def savings(
     program, tariff = Program.of_cycles(cycles), _tariff(settings)
     figure_settings = settings.document.section(FigureSettings, "figures")
     ejector = Unit(settings.data, figure_settings.energy_kwh_m3)
-    predicted = predict(ejector, settings.monitor.healthy, program)
+    with status() as say:
+        say("predicting other settings")
+        predicted = predict(ejector, settings.monitor.healthy, program)
     rate = tariff.cycles_a_year(mean_cycle_time(program.cycle_seconds))
-    air = [cycle.measured["air"] for cycle in _cycles(recorded, settings)]
+    air = [cycle.measured["air"] for cycle, _ in _read(recorded, settings)]
     measured = [value for value in air if math.isfinite(value)]
     print(savings_table(predicted, rate, tariff, measured))
     if json_file is not None:
@@ -255,7 +259,6 @@ def forget(
 
     It is for an ejector that no run watches any more. The counters go on counting them.
     """
-    from twin.cli.console import status
     from twin.figures.retention import forget as forget_cycles
     from twin.instants import DAY_NS
 
@@ -415,11 +418,17 @@ def _tariff(settings: "Config") -> "Tariff":
     return Tariff.of(settings.document.section(FigureSettings, "figures"))
 
 
-def _cycles(recorded: "Log", settings: "Config") -> "list[CycleFigures]":
-    """The key figures of every cycle of a log."""
+def _read(recorded: "Log", settings: "Config") -> "list[tuple[CycleFigures, Mapping[str, Any]]]":
+    """Every cycle of a log with its key figures, and in the database's form."""
     from twin.figures.read import of_log
 
-    return [cycle for cycle, _ in of_log(recorded, key_figures_of(settings))]
+    found = []
+    with status() as say:
+        say(f"key figures of {recorded.path.name}")
+        for cycle in of_log(recorded, key_figures_of(settings)):
+            found.append(cycle)
+            say(f"key figures of {recorded.path.name}: {len(found)} cycles")
+    return found
 
 
 def _say_if_deleted(store: "Store", unit: "Unit", cycles: "Sequence[Mapping[str, Any]]") -> None:

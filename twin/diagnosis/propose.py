@@ -4,6 +4,7 @@ The log in which it was found is its test: with the entry in the catalogue, a di
 must name it.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -98,12 +99,14 @@ def proposed(diagnosis: Diagnosis, config: Config, log: Path, file: Path) -> str
     return INTRODUCTION.format(sentence=sentence, file=file) + "\n" + tomli_w.dumps(tables)
 
 
-def named_on(proposal: Proposal, config: Config, log: Log, where: str) -> str:
+def named_on(
+    proposal: Proposal, config: Config, log: Log, where: str, progress: Callable[[str], None]
+) -> str:
     """The diagnosis' answer if the test of an entry fails; empty if the effect is named."""
     catalogue = {**config.data.catalogue, proposal.name: proposal.effect}
     config = replace(config, data=config.data.model_copy(update={"catalogue": catalogue}))
     blocks = (rows for rows, _ in log.blocks())
-    answer = diagnose(config, blocks, where, lambda _: None).json
+    answer = diagnose(config, blocks, where, progress).json
     names = [cause["effect"] for cause in answer["causes"]]
     if proposal.name in names:
         return ""

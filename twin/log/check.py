@@ -17,6 +17,7 @@ from twin.quality import Quality
 from twin.signals import NS, LastRow, Samples, Ticks, unseen_ns
 
 Piece = tuple[Samples, Ticks, list[Event]]
+Watch = Callable[[Iterator[Piece]], Iterator[Piece]]  # passes pieces on, and shows how many
 
 
 @dataclass(frozen=True)
@@ -107,12 +108,12 @@ class _StreamStatistics:
         self.duration_s += float(steps[(steps > 0) & ~jumps].sum() * NS)
 
 
-def check(path: Path) -> Report:
+def check(path: Path, watch: Watch = iter) -> Report:
     """Read a whole log and report what it holds; SourceError if the file is no log."""
-    return _scan(open_log(path), lambda *_: None)
+    return _scan(open_log(path), lambda *_: None, watch)
 
 
-def recover(path: Path, out: Path) -> Report:
+def recover(path: Path, out: Path, watch: Watch = iter) -> Report:
     """Copy the readable part of a log to a complete new log; the report is about the old one.
 
     SourceError if the file is no log, or if ``out`` exists or cannot be written.
@@ -120,13 +121,15 @@ def recover(path: Path, out: Path) -> Report:
     log = open_log(path)
     origin = log.header.metadata | {RECOVERED: path.name}
     with Recorder(out, replace(log.header, metadata=origin)) as recorder:
-        return _scan(log, recorder.write)
+        return _scan(log, recorder.write, watch)
 
 
-def _scan(log: Log, write: Callable[[Samples, Ticks, Sequence[Event]], None]) -> Report:
+def _scan(
+    log: Log, write: Callable[[Samples, Ticks, Sequence[Event]], None], watch: Watch
+) -> Report:
     damage: list[Damage] = []
     statistics = _StreamStatistics()
-    for samples, ticks, events in _pieces(log, damage):
+    for samples, ticks, events in watch(_pieces(log, damage)):
         statistics.add(samples)
         statistics.events += len(events)
         write(samples, ticks, events)
