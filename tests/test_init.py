@@ -177,6 +177,53 @@ def test_on_a_terminal_it_asks_what_no_flag_says(
     assert "nameplate" not in said
 
 
+NAMESPACE, SCALE = "Namespace of the nodes", "for a raw value of 1"
+ASKED_OF_A_PLC = [
+    ((*OPC_UA, "--ring"), "--namespace", NAMESPACE),
+    ((*OPC_UA, "--no-ring"), "--namespace", NAMESPACE),
+    ((*MODBUS, "--no-ring"), "--scale", SCALE),
+    ((*MODBUS, "--ring", "--pressure-type", "int32"), "--scale", SCALE),
+    ((*MODBUS, "--ring"), "", ""),
+    ((*MODBUS, "--no-ring", "--pressure-type", "float32"), "", ""),
+]
+
+
+@pytest.mark.parametrize(("flags", "flag", "question"), ASKED_OF_A_PLC, ids=str)
+def test_namespace_and_scale_are_asked_where_they_apply_and_else_told_as_guessed(
+    flags: tuple[str, ...],
+    flag: str,
+    question: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, "init", *flags) == 0
+    guessed = " ".join(line for line in Path("cell.toml").read_text().splitlines() if "--" in line)
+    assert {name for name in ("--namespace", "--scale") if name in guessed} == {flag} - {""}
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "stdin", Terminal("\n" * 30))
+    assert twin(monkeypatch, "init", *flags, "--force") == 0
+    told = "".join(capsys.readouterr())
+    assert {asked for asked in (NAMESPACE, SCALE) if asked in told} == {question} - {""}
+
+
+@pytest.mark.parametrize("scale", ["0", "wide"])
+def test_a_scale_that_is_no_number_is_refused(scale: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert twin(monkeypatch, "init", *MODBUS, "--no-ring", "--scale", scale) == 2
+    assert not Path("cell.toml").exists()
+
+
+def test_an_editor_finds_the_schema(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twin(monkeypatch, "init") == 0
+    capsys.readouterr()
+    first, second, *_ = Path("cell.toml").read_text().splitlines()
+    command, file = second.partition("twin ")[2].split(" > ")
+    assert first == f"#:schema ./{file}"
+    assert twin(monkeypatch, *command.split()) == 0
+    assert '"driver"' in capsys.readouterr().out
+
+
 def test_a_file_that_is_there_is_not_overwritten(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

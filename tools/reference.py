@@ -61,7 +61,7 @@ Made from the program by `python tools/reference.py`.
 `twin config check FILE` names all mistakes of a configuration at once.
 `twin config schema > twin.schema.json` makes a JSON Schema of these tables. An editor that knows
 TOML schemas (Taplo, Even Better TOML) then completes and checks keys, if the first line of a
-configuration is `#:schema ./twin.schema.json`. `twin init` makes a configuration to begin with.
+configuration is `#:schema ./twin.schema.json`. `twin init` makes a configuration that begins so.
 
 Every table and key may be left out, unless it is *required*.
 """

@@ -24,6 +24,8 @@ UNKNOWN = "unknown"
 NO_PLC = "none"
 FILE_ONLY, PLACEHOLDER = "none: there are only files", "192.168.0.10:502"
 OPC_UA = "opc.tcp://"
+SIMULATED_NAMESPACE = "urn:ejector-twin:plc"  # of the simulated PLC
+SCHEMA = "twin.schema.json"
 LAYOUTS = {  # pressure and commands in the simulated PLC and in docs/connect-your-plc.md
     ("modbus", True): ("30002", "30005/0", "30005/1"),
     ("modbus", False): ("40001", "00001", "00002"),
@@ -174,6 +176,17 @@ def _range(text: str) -> tuple[float, float] | None:
     return low, high
 
 
+def _scale(text: str) -> float:
+    """Parse the scale of raw values: usage error unless it is a number other than zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < abs(value) < 1e9:
+        raise typer.BadParameter(f"{text!r} is no number other than zero")
+    return value
+
+
 @dataclass(frozen=True)
 class Connection:
     """Source of pressure and commands."""
@@ -274,15 +287,18 @@ def init(
         typer.Option("--ring/--no-ring", help="The PLC keeps a ring of scans, or is polled."),
     ] = None,
     namespace: Annotated[
-        str, typer.Option(metavar="URI", help="Of the OPC UA nodes.")
-    ] = "urn:ejector-twin:plc",
+        str | None, typer.Option(metavar="URI", help="Of the OPC UA nodes.")
+    ] = None,
     pressure: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of the pressure: register or node.")
     ] = None,
     coded: Annotated[
         Number | None, typer.Option("--pressure-type", help="Of the pressure's register.")
     ] = None,
-    scale: Annotated[float, typer.Option(help="Pressure in its unit for a raw value of 1.")] = 1.0,
+    scale: Annotated[
+        str | None,
+        typer.Option(metavar="FLOAT", help="Pressure in its unit for a raw value of 1."),
+    ] = None,
     suction: Annotated[
         str | None, typer.Option(metavar="ADDRESS[/BIT]", help="Of the suction command.")
     ] = None,
@@ -395,27 +411,42 @@ def _connection(
     questions: Questions,
     address: str,
     ring: bool | None,
-    namespace: str,
+    namespace: str | None,
     tags: tuple[str | None, ...],
     coded: Number | None,
-    scale: float,
+    scale: str | None,
 ) -> Connection:
     kind = "opcua" if address.startswith(OPC_UA) else "modbus"
     question = "Does the PLC keep a ring of scans, as docs/connect-your-plc.md has it (yes, no)"
     answer = None if ring is None else Answer.YES if ring else Answer.NO
     is_ring = questions.ask("--ring", answer, question, Answer.YES, Answer) is Answer.YES
+    if kind == "opcua":
+        question = "Namespace of the nodes, an URI"
+        uri = questions.ask("--namespace", namespace, question, SIMULATED_NAMESPACE, str)
+    else:
+        uri = namespace or SIMULATED_NAMESPACE
     layout, number = LAYOUTS[kind, is_ring], coded or Number.FLOAT32
     if is_ring:  # a ring has its own layout
         at, on, off = (tag or layout_tag for tag, layout_tag in zip(tags, layout, strict=True))
-        return Connection(address, is_ring, namespace, at, number, scale, on, off)
+        factor = _factor(questions, kind, number, scale)
+        return Connection(address, is_ring, uri, at, number, factor, on, off)
     at = questions.ask("--pressure", tags[0], "Address of the pressure", layout[0], str)
     if kind == "modbus":
         question = f"Its type ({_of(Number)})"
         number = questions.ask("--pressure-type", coded, question, Number.INT16, Number)
+    factor = _factor(questions, kind, number, scale)
     question = "Address of the suction command, with /BIT in a word"
     on = questions.ask("--suction", tags[1], question, layout[1], str)
     off = questions.ask("--blow-off", tags[2], "Address of the blow-off command", layout[2], str)
-    return Connection(address, is_ring, namespace, at, number, scale, on, off)
+    return Connection(address, is_ring, uri, at, number, factor, on, off)
+
+
+def _factor(questions: Questions, kind: str, number: Number, scale: str | None) -> float:
+    """The scale of raw values: asked of whole numbers in registers, 1 for others."""
+    if kind == "modbus" and number is not Number.FLOAT32:
+        question = "Pressure in its unit for a raw value of 1"
+        return questions.ask("--scale", scale, question, "1", _scale)
+    return _scale(scale or "1")
 
 
 def _check(text: str, file: Path) -> None:
@@ -460,6 +491,8 @@ def configuration(
     note = "as on the nameplate" if is_known else "not known: a type of its own"
     first, second = next_commands(file, connection)
     lines = [
+        f"#:schema ./{SCHEMA}",
+        f"# An editor then completes and checks keys: twin config schema > {SCHEMA}",
         "# What a person knows of this ejector. What a calibration finds does not",
         "# stand here but in the asset database. Every key of [data]: docs/data-set.md",
         f"# Next: {first}; then {second}",
@@ -499,7 +532,9 @@ def _driver(connection: Connection, sensor: Sensor) -> list[str]:
     if is_opcua:
         polled, key = "subscribe", "node"
         lines += ['kind = "opcua"', f"url = {_quoted(connection.address)}"]
-        lines += [_line(f"namespace = {_quoted(connection.namespace)}", "of the nodes")]
+        is_simulated = connection.namespace == SIMULATED_NAMESPACE
+        remark = "of the simulated PLC: put your nodes' here" if is_simulated else "of the nodes"
+        lines += [_line(f"namespace = {_quoted(connection.namespace)}", remark)]
     else:
         polled, key = "poll", "address"
         host, _, port = connection.address.rpartition(":")
