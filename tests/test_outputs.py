@@ -196,6 +196,22 @@ def test_a_long_command_shows_no_progress_in_a_pipe(
     assert "\x1b" not in out + err
 
 
+@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}], ids=str)
+def test_progress_is_coloured_unless_no_color_says_otherwise(
+    environment: dict[str, str],
+    log: Path,
+    tmp_path: Path,
+    seen: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    shown = seen("export", log, "-o", tmp_path / "rows.csv")
+    assert "exporting (samples)" in shown
+    assert bool(re.search(r"\x1b\[(\d+;)*3\d", shown)) == (not environment)  # a colour (SGR)
+
+
 def test_the_paper_shows_its_steps(
     seen: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

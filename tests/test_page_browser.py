@@ -882,6 +882,15 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
 @pytest.mark.slow
 @pytest.mark.needs("axe")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_violation_on_the_page_of_an_error(site: Site, scheme: str) -> None:
+    page = site.open("nothing-here", "phone", color_scheme=scheme, bypass_csp=True)
+    expect(page.get_by_role("heading", name="Not Found")).to_be_visible()
+    assert violations(page) == []
+
+
+@pytest.mark.slow
+@pytest.mark.needs("axe")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site, scheme: str) -> None:
     site.run.suck(2.0)
     page = site.open("", "phone", color_scheme=scheme, bypass_csp=True)

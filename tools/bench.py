@@ -23,6 +23,7 @@ from benchmarks import (
     clients,
     detection,
     diagnosis,
+    first_view,
     fmu,
     growth,
     isolation,
@@ -124,6 +125,15 @@ BENCHMARKS = (
         (
             Figure("all on, a page open: CPU of the live process", "% of a core", limit=15.0),
             Figure("all on, a page open: CPU of the page's process", "% of a core"),
+        ),
+    ),
+    Benchmark(
+        "first-view",
+        first_view.page,
+        "That page, opened seven times in Chromium with an empty cache, from the request on.",
+        (
+            Figure("page: its document parsed", "ms"),
+            Figure("page: the first ejector shown", "ms", limit=1000.0),
         ),
     ),
     Benchmark(
@@ -316,6 +326,13 @@ BENCHMARKS = (
             Figure("start: twin --help", "ms", "Python that does nothing", 300.0),
             Figure("start: twin replay, a log of 10 s", "ms", STARTED, 2000.0),
         ),
+    ),
+    Benchmark(
+        "first-row",
+        first_view.row,
+        "`twin run` beside the simulated PLC, everything in the page cache, from its start until "
+        "its log holds rows.",
+        (Figure("start: twin run, first row", "ms", STARTED),),
     ),
 )
 

@@ -25,9 +25,10 @@ KEPT = {"figures": {"keep": True}, "alarms": {"keep": True}, "page": {"keep": Tr
 def watched(run: Run) -> Sequence[Measured]:
     """CPU shares of a run that stores everything, and of its page with one browser."""
     with ExitStack() as stack:
-        config = _config(run.folder / "watched", "rig-01", stack.enter_context(plc()), KEPT)
+        config = configured(run.folder / "watched", "rig-01", stack.enter_context(plc()), KEPT)
         process = stack.enter_context(live(run.folder / "watched.mcap", [config]))
-        page = stack.enter_context(_page(config))
+        page, url = stack.enter_context(served(config))
+        stack.enter_context(_client(url))
         shares = _shares(run, "a page open", [process.pid, page])
     return tuple(Measured(series) for series in zip(*shares, strict=True))
 
@@ -41,14 +42,14 @@ def together(
     folder = run.folder / f"{len(ports)} together"
     log = folder / "log.mcap"
     pairs = zip(names, ports, strict=True)
-    configs = [_config(folder / name, name, port, {}) for name, port in pairs]
+    configs = [configured(folder / name, name, port, {}) for name, port in pairs]
     # A single ejector's log has the given name.
     logs = [log.with_suffix(f".{name}.mcap") for name in names] if len(ports) > 1 else [log]
     with live(log, configs, logs) as process:
         yield process, logs
 
 
-def _config(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:
+def configured(folder: Path, name: str, port: int, more: dict[str, dict[str, bool]]) -> Path:
     """The test rig's configuration for another ejector, in a new folder."""
     tables = tomllib.loads(CONFIG.read_text(encoding="utf-8")) | more
     tables["asset"]["id"], tables["driver"]["port"] = name, port
@@ -73,8 +74,8 @@ def _shares(run: Run, name: str, numbers: Sequence[int]) -> list[list[float]]:
 
 
 @contextmanager
-def _page(config: Path) -> Iterator[int]:
-    """Run ``twin serve`` with a client that reads everything; yields its process number."""
+def served(config: Path) -> Iterator[tuple[int, str]]:
+    """Run ``twin serve`` of one ejector; yields its process number, and its address."""
     command = [TWIN, "serve", "--port", "0", "--config", config]
     with on_core(PLC_CORE):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -82,16 +83,22 @@ def _page(config: Path) -> Iterator[int]:
         try:
             assert process.stdout is not None
             url = process.stdout.readline().removeprefix("the page is at ").strip().rstrip("/")
-            with connect(f"ws{url.removeprefix('http')}/live", origin=url) as browser:
-                browser.send("0")
-                while "rows" not in json.loads(browser.recv()):
-                    pass
-                taking = threading.Thread(target=_take, args=(browser,))
-                taking.start()
-                yield process.pid
-            taking.join()
+            yield process.pid, url
         finally:
             process.terminate()
+
+
+@contextmanager
+def _client(url: str) -> Iterator[None]:
+    """A client of the page that reads everything it is told."""
+    with connect(f"ws{url.removeprefix('http')}/live", origin=url) as browser:
+        browser.send("0")
+        while "rows" not in json.loads(browser.recv()):
+            pass
+        taking = threading.Thread(target=_take, args=(browser,))
+        taking.start()
+        yield
+    taking.join()
 
 
 def _take(browser: ClientConnection) -> None:

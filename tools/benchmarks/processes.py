@@ -50,10 +50,8 @@ def live(
     ``port`` is that of the PLC if it differs from the configuration. ``logs`` are the paths of the
     logs of several ejectors.
     """
-    address = [] if port is None else ["--address", f"127.0.0.1:{port}"]
-    command = [TWIN, "run", *configs, *address, "--log", log]
     with on_core(TWIN_CORE):
-        process = subprocess.Popen(command, stdout=stdout)
+        process = subprocess.Popen(command(log, configs, port), stdout=stdout)
     with process:
         try:
             for path in logs or [log]:
@@ -64,6 +62,12 @@ def live(
             process.wait()  # before Popen's exit closes the pipe that it still writes to
     if process.returncode != INTERRUPTED:
         sys.exit(f"twin run ended with exit code {process.returncode}")
+
+
+def command(log: Path, configs: Sequence[Path], port: int | None) -> list[str | Path]:
+    """The command line of ``twin run``; ``port`` is the PLC's, if not as configured."""
+    address = [] if port is None else ["--address", f"127.0.0.1:{port}"]
+    return [TWIN, "run", *configs, *address, "--log", log]
 
 
 def usage(command: Sequence[str | Path]) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from twin.signals import Samples, Ticks
 
 REPEATS = 3
 STARTS = 5
+IMPORTS = "import numba, numpy, pydantic, typer"
 HOUR_MIN = 60
 PART_MIN = 10  # length over which parts of a replay and the model in C are measured
 
@@ -114,14 +115,14 @@ def starts(run: Run) -> Sequence[Measured]:
     with on_core(TWIN_CORE):
         return (
             _by_turns([TWIN, "--help"], [*python, "pass"]),
-            _by_turns([TWIN, "replay", small], [*python, "import numba, numpy, pydantic, typer"]),
+            _by_turns([TWIN, "replay", small], [*python, IMPORTS]),
         )
 
 
 def _by_turns(ours: Sequence[str | Path], floor: Sequence[str | Path]) -> Measured:
-    _seconds(ours)
-    _seconds(floor)
-    pairs = [(_seconds(ours) * 1e3, _seconds(floor) * 1e3) for _ in range(STARTS)]
+    seconds_of(ours)
+    seconds_of(floor)
+    pairs = [(seconds_of(ours) * 1e3, seconds_of(floor) * 1e3) for _ in range(STARTS)]
     values, floors = zip(*pairs, strict=True)
     return Measured(values, floors)
 
@@ -133,7 +134,8 @@ def _small_log(folder: Path) -> Path:
     return path
 
 
-def _seconds(command: Sequence[str | Path]) -> float:
+def seconds_of(command: Sequence[str | Path]) -> float:
+    """Time (s) of a whole process."""
     begin = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - begin
