@@ -33,7 +33,7 @@ from twin.log.header import LogHeader
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.model.courses import table as courses
-from twin.model.effects import table
+from twin.model.effects import EFFECTS, table
 from twin.model.mechanism import PLACES, WHENS
 from twin.signals import SAMPLE, TICK
 
@@ -76,6 +76,25 @@ def healthy_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # Messages.
+
+
+def test_the_effects_are_written_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "effects.json"
+    assert twin(monkeypatch, "effects", "--json", file) == 0
+    answer = json.loads(file.read_text())
+    assert [effect["name"] for effect in answer["effects"]] == list(EFFECTS)
+    leak = answer["effects"][0]
+    assert leak["sentence"] == EFFECTS[leak["name"]].sentence
+    (flow,) = leak["parameters"]
+    declared = EFFECTS[leak["name"]].parameters[0]
+    assert flow == {
+        "name": "sonic_flow",
+        "unit": "sl/min",
+        "low": declared.low,
+        "high": declared.high,
+    }
+    assert {"constant", "ramp"} <= {course["name"] for course in answer["courses"]}
+    assert twin(monkeypatch, "effects", "--json", file, "add", "x.toml") == 2
 
 
 def test_effects_are_listed(

@@ -216,6 +216,23 @@ def test_autoset_gives_what_stands_in_a_configuration(figures: Run) -> None:
     assert tomllib.loads(figures("autoset", "--tolerance", "0"))["figures"]["permitted_t1_ms"] > 290
 
 
+def test_counters_and_autoset_are_written_as_json(figures: Run, tmp_path: Path) -> None:
+    fill(10, 100)
+    answers = {}
+    for command in ("counters", "autoset"):
+        for option in ("--json", "-o"):
+            file = tmp_path / f"{command}{option}.json"
+            figures(command, option, str(file))
+            answers[command, option] = json.loads(file.read_text())
+        assert answers[command, "--json"] == answers[command, "-o"]
+    counts, taught = answers["counters", "-o"], answers["autoset", "-o"]
+    assert {counts["id"], taught["id"]} == {"gripper-01"}
+    assert counts["total"] == counts["erasable"] == {"cycles": 100, "switchings": 100, "alarms": 0}
+    table = tomllib.loads(figures("autoset"))["figures"]
+    assert {name: round(taught[name]) for name in table} == table
+    assert taught["cycles"] == 5
+
+
 def test_autoset_learns_from_good_cycles_only(figures: Run) -> None:
     fill(1, 20, warnings=["leakage_over_limit"])  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="no good cycle is stored"):

@@ -104,7 +104,7 @@ def test_a_broken_log_costs_only_itself(
     good.write_bytes(whole)
     found, page = tmp_path / "f.json", tmp_path / "f.html"
     asked = ("fleet", "report", tmp_path, "--assets", tmp_path / "f.sqlite", "--workers", "1")
-    assert twin(monkeypatch, *asked, "--json", found, "--html", page) == 3  # as for one log alone
+    assert twin(monkeypatch, *asked, "--json", found, "--report", page) == 3  # as for one log alone
     said = capsys.readouterr()
     assert "1 unit: none stands out, 1 could not be judged; 2 logs could not be used" in said.out
     assert [refused["log"] for refused in json.loads(found.read_text())["refused"]] == [
@@ -113,8 +113,8 @@ def test_a_broken_log_costs_only_itself(
     ]
     assert "not an MCAP file" in page.read_text(encoding="utf-8")
     assert "1 of 3 logs done, 0 were known, 2 could not be" in said.out
-    german = ("fleet", "report", "--assets", tmp_path / "f.sqlite", "-o", page, "--language", "de")
-    assert twin(monkeypatch, *german) == 0
+    german = ("fleet", "report", "--assets", tmp_path / "f.sqlite", "--language", "de")
+    assert twin(monkeypatch, *german, "--html", page) == 0  # the former name of --report
     assert "<h1>1 Gerät: keines fällt auf, 1 nicht beurteilbar</h1>" in page.read_text()
     assert str(damaged) in said.err
     assert str(foreign) in said.err

@@ -110,7 +110,7 @@ def main() -> None:
                 f"\r{done} of {arguments.units} units recorded", end="", file=sys.stderr, flush=True
             )
     answer, page = arguments.folder / "report.json", arguments.folder / "report.html"
-    files = ["--json", str(answer), "--html", str(page)]
+    files = ["--json", str(answer), "--report", str(page)]
     command = [*TWIN, "fleet", "report", str(logs), "--assets", str(database), *files]
     subprocess.run(command, check=True)
     rank = {entry["id"]: entry["rank"] for entry in json.loads(answer.read_text())["units"]}

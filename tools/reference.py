@@ -190,11 +190,9 @@ def commands() -> str:
     """The reference of all commands, in the order of the help."""
     parts = [COMMANDS]
     for name, command in _in_order(get_command(app)):
-        below = getattr(command, "commands", None)
-        if below is None:
-            parts.append(f"## twin {name}\n\n{_command(command)}\n")
+        parts.append(f"## twin {name}\n\n{_command(command)}\n")
+        if not hasattr(command, "commands"):
             continue
-        parts.append(f"## twin {name}\n\n{_plain(command.help)}\n")
         parts += [
             f"### twin {name} {subname}\n\n{_command(subcommand)}\n"
             for subname, subcommand in _in_order(command)
@@ -208,7 +206,8 @@ def _in_order(group: Any) -> Iterator[tuple[str, Any]]:
 
 def _command(command: Any) -> str:
     lines = [_plain(command.help)]
-    rows = [_parameter(parameter) for parameter in command.params]
+    shown = (parameter for parameter in command.params if not getattr(parameter, "hidden", False))
+    rows = [_parameter(parameter) for parameter in shown]
     if rows:
         lines += ["", "| argument, option | default | what |", "| --- | --- | --- |", *rows]
     return "\n".join(lines)

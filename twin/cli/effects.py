@@ -2,30 +2,37 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from twin.cli.app import App, read_config, say_if_new
 from twin.cli.console import status
+from twin.cli.options import JsonAlone
 from twin.errors import ConfigError, SourceError
+from twin.files import require_writable, write_json
 
 if TYPE_CHECKING:
     from twin.assets.database import Assets
     from twin.assets.record import Record
     from twin.diagnosis.propose import Proposal
+    from twin.model.effects import Effect
+    from twin.model.mechanism import Place, When
 
 effects_app = App("The ways a real ejector can differ from its data set.", alone=True)
 
 
 @effects_app.callback(invoke_without_command=True)
-def list_(context: typer.Context) -> None:
+def list_(context: typer.Context, json_file: JsonAlone = None) -> None:
     """List the effects, their courses, and what a mechanism that nobody listed can be made of.
 
     Those that were taken in stand with their type or unit: twin assets show NAME.
     """
     if context.invoked_subcommand:
+        if json_file is not None:
+            raise ConfigError("--json is for the list of effects", "leave it out")
         return
+    require_writable(json_file)
     from twin.model.courses import table as courses
     from twin.model.effects import table
     from twin.model.mechanism import places_table, whens_table
@@ -33,6 +40,32 @@ def list_(context: typer.Context) -> None:
     tables = (text.replace("<br>", "; ") for text in (places_table(), whens_table()))
     heading = "Where and when something can act that is none of these:"
     print(table("; "), courses(), heading, *tables, sep="\n\n")
+    if json_file is not None:
+        write_json(json_file, _plain())
+
+
+def _plain() -> dict[str, Any]:
+    """The effects, their courses, and what mechanisms can be made of, as JSON."""
+    from twin.model.courses import MEANING
+    from twin.model.effects import EFFECTS
+    from twin.model.mechanism import PLACES, WHENS
+
+    return {
+        "effects": [
+            _described(effect) | {"look_at": effect.look_at} for effect in EFFECTS.values()
+        ],
+        "courses": [{"name": str(course), "sentence": MEANING[course]} for course in MEANING],
+        "places": [_described(place) for place in PLACES.values()],
+        "whens": [_described(when) for when in WHENS.values()],
+    }
+
+
+def _described(part: "Effect | Place | When") -> dict[str, Any]:
+    """Name, sentence and parameters with unit and bounds."""
+    parameters = [
+        {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high} for p in part.parameters
+    ]
+    return {"name": part.name, "sentence": part.sentence, "parameters": parameters}
 
 
 @effects_app.command()

@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -233,8 +234,10 @@ def counters(
     erase: Annotated[
         bool, typer.Option("--erase", help="Let the erasable counters begin anew.")
     ] = False,
+    json_file: JsonAlone = None,
 ) -> None:
     """Suction cycles, valve switchings and alarms: in all, and since they were erased."""
+    require_writable(json_file)
     with _open(figures, config, create=False) as store:
         chosen = chosen_unit(store, config, unit)
         if erase:
@@ -243,6 +246,9 @@ def counters(
     print(f"{'':18}{'in all':>12}{'erasable':>12}")
     for name, label in _COUNTER_LABELS.items():
         print(f"{label:18}{getattr(total, name):12}{getattr(erasable, name):12}")
+    if json_file is not None:
+        counts = {"total": asdict(total), "erasable": asdict(erasable)}
+        write_json(json_file, {"type": chosen.type, "id": chosen.id, **counts})
 
 
 @figures_app.command()
@@ -282,16 +288,20 @@ def autoset(
             metavar="S", callback=not_negative, help="Share of the worst good cycle, over it."
         ),
     ] = None,
+    json_file: JsonAlone = None,
 ) -> None:
     """Permitted t1 and leakage from the last good cycles, to put into the configuration."""
     from twin.figures.autoset import autoset as teach
 
+    require_writable(json_file)
     share = _settings(config).autoset_tolerance if tolerance is None else tolerance
     with _open(figures, config, create=False) as store:
         chosen = chosen_unit(store, config, unit)
         permitted = teach(store.history(chosen), share)
     print(f"# from the last {permitted.cycles} good cycles of {chosen.id or chosen.type}")
     print(permitted.toml(), end="")
+    if json_file is not None:
+        write_json(json_file, {"type": chosen.type, "id": chosen.id, **asdict(permitted)})
 
 
 @figures_app.command()

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from twin.cli.app import App, read_config, say_if_cut, say_if_new
-from twin.cli.options import JSON, PAGE, JsonAlone, JsonFile, LanguageCode, written_as
+from twin.cli.options import (
+    JSON,
+    PAGE,
+    JsonAlone,
+    JsonFile,
+    LanguageCode,
+    PageFile,
+    written_as,
+)
 from twin.cli.options import chosen as chosen_file
 from twin.cli.options import output as output_option
 from twin.errors import ConfigError, SourceError
@@ -56,11 +64,8 @@ Scheduler = Annotated[
     str, typer.Option(metavar="ADDRESS", help="Where Dask's is: tcp://host:8786.")
 ]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes here; else one for each core.")]
-Page = Annotated[
-    Path | None,
-    typer.Option(
-        "--html", metavar="F.html", callback=written_as(PAGE), help="Write a page with a picture."
-    ),
+FormerReport = Annotated[  # the former name of --report
+    Path | None, typer.Option("--html", hidden=True, callback=written_as(PAGE))
 ]
 
 # What a kind of work does with a log.
@@ -110,7 +115,8 @@ def report(
     workers: Workers = None,
     output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
-    page: Page = None,
+    report: PageFile = None,
+    former_report: FormerReport = None,
     language: LanguageCode = ENGLISH.code,
 ) -> None:
     """Say which units stand out or drift, and in what, worst first; new logs are replayed."""
@@ -120,7 +126,7 @@ def report(
     from twin.fleet.results_database import open_store
 
     json_file = chosen_file(output, "--json", json_file, JSON)
-    page = chosen_file(output, "--html", page, PAGE)
+    page = chosen_file(output, "--report", report or former_report, PAGE)
     require_writable(json_file, page)
     page_language = language_of(language, "--language")
     files, workers_of = _files(logs or []), _Engine(engine, scheduler, workers)

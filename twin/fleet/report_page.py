@@ -201,7 +201,7 @@ def _listed(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) ->
     if not rows:
         return []
     omitted = len(rows) - MOST_LISTED
-    remark = [f"and {omitted} more; --json and --html have all"] if omitted > 0 else []
+    remark = [f"and {omitted} more; --json and --report have all"] if omitted > 0 else []
     return ["", *([title] if title else []), *_columns([header, *rows[:MOST_LISTED]]), *remark]
 
 
