@@ -131,6 +131,12 @@ def test_a_name_that_is_said_to_stand_in_a_file_is_defined_there() -> None:
     assert [pair for pair in pairs if pair[1] not in top_names(pair[2])] == []
 
 
+def test_every_picture_has_a_maker() -> None:
+    table = re.findall(r"^\| (`.*?) \|", text_of("CONTRIBUTING.md"), re.MULTILINE)
+    named = {name for row in table for name in re.findall(r"`([\w-]+\.(?:png|svg))`", row)}
+    assert named == {path.name for path in (DOCS / "pictures").iterdir()}
+
+
 # --- command lines --------------------------------------------------------------------------------
 
 
