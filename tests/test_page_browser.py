@@ -262,6 +262,25 @@ def test_the_report_is_read_inside_the_page(site: Site) -> None:
 
 
 @pytest.mark.slow
+def test_the_card_says_at_first_sight_what_the_cause_costs_a_year(site: Site) -> None:
+    english, german = site.open(locale="en-GB"), site.open(locale="de-DE")
+    site.run.suck(0.5)
+    site.run.leak()
+    money = {"value": 38.0, "low95": 34.0, "high95": 41.0}
+    cost = {"money_per_year": money, "currency": "€", "operating_hours": 4000.0}
+    leak = {"effect": "leakage", "parameters": {}, "cost": cost | {"differs_from_zero": True}}
+    answer = {"verdict": "explained", "causes": [leak]}
+    told = {"answer": answer, "alarm_ns": site.run.alarms._deviation_ns}
+    site.run.say(Kind.DIAGNOSIS, "a leak", **told)
+    site.until_light(english, "red")
+    for page, words in ((english, "costs about 38 € a year"), (german, "kostet etwa 38 €")):
+        shown = card(page).locator("dl", has_text=words).first
+        expect(shown).to_be_visible()  # without opening the evidence
+    english.get_by_role("tab", name="History").click()
+    expect(english.locator("#episodes article")).to_contain_text("costs about 38 € a year")
+
+
+@pytest.mark.slow
 def test_tabs_go_by_keyboard_and_what_is_new_is_told_to_who_listens(site: Site) -> None:
     page = site.open()
     site.until_light(page, "green")
