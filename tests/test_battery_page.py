@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 
 from tools import battery_first
+from tools.battery import recounted
 from tools.battery_cases import FOUND, Case, CaseFile, Hidden, first_of
-from tools.battery_page import ASKED, all_kept, likely, summary, tables, with_run
+from tools.battery_page import ASKED, all_kept, expected, likely, summary, tables, with_run
+from tools.calibration_coverage import rig_of, shipped
 from twin.errors import TwinError
 
 PAGE = (Path(__file__).parent.parent / "docs" / "battery.md").read_text(encoding="utf-8")
@@ -75,7 +77,8 @@ def test_a_page_without_a_place_for_the_run_is_refused() -> None:
 def test_tables_say_what_was_reached_and_what_was_not_found() -> None:
     cases = [single("porous_leakage", moved_mbar=3.14, noise_mbar=0.4)]
     text = tables(cases)
-    assert "| explained and wrong | 1 of 1 (100%) | 3% to 100% | at most 1% | **no** |" in text
+    wrong = ASKED["wrong"].words
+    assert f"| {wrong} | 1 of 1 (100%) | 3% to 100% | at most 0.5% | **no** |" in text
     assert "| `leakage` | 1 | 0 | 0 | porous_leakage 1 | 1 | 1.31 |" in text
     row = (
         "| single | 7 | gripper | leakage constant 1 | 3.1 mbar | 0.4 mbar | explained |"
@@ -95,13 +98,80 @@ def test_a_size_counts_where_it_means_the_same_in_both_worlds() -> None:
     assert of_volume["flows"] is True
 
 
-@pytest.mark.parametrize("kind", ["healthy", "single", "pair"])
-def test_explained_and_wrong_is_what_names_a_cause_that_is_not_there(kind: str) -> None:
-    hidden = {"healthy": [], "single": [LEAK], "pair": [LEAK, replace(LEAK, effect="sensor_lag")]}
-    wrong = Case(kind, 1, "gripper", hidden[kind], answer("sensor_gain"))
+STUCK = Hidden("sticking_valve", "constant", 30.0)
+HIDDEN = {
+    "healthy": [],
+    "single": [LEAK],
+    "pair": [LEAK, replace(LEAK, effect="sensor_lag")],
+    "unlisted": [replace(LEAK, effect="condensate")],
+}
+
+
+@pytest.mark.parametrize("kind", HIDDEN)
+def test_explained_and_wrong_is_what_names_no_cause_that_acts(kind: str) -> None:
+    wrong = Case(kind, 1, "gripper", HIDDEN[kind], answer("sensor_gain"))
     assert wrong.outcomes["wrong"] is True
+    assert wrong.outcomes["spurious"] is True
     unsure = replace(wrong, answer=answer("sensor_gain", "unlisted"))
-    assert unsure.outcomes["wrong"] is False
+    assert "wrong" not in unsure.outcomes  # of all that is explained
+    assert unsure.outcomes["spurious"] is True  # of all answers
+    silent = replace(wrong, answer=answer("", "consistent") | {"causes": []})
+    assert silent.outcomes["spurious"] is False
+
+
+def test_half_a_pair_is_not_wrong_but_spurious() -> None:
+    half, other = answer("leakage"), answer("sensor_gain")["causes"]
+    case = Case("pair", 1, "gripper", HIDDEN["pair"], half | {"causes": half["causes"] + other})
+    assert case.outcomes["wrong"] is False
+    assert case.outcomes["spurious"] is True
+    assert case.outcomes["pairs"] is False
+
+
+@pytest.mark.parametrize(("course", "is_right"), [("intermittent", True), ("constant", False)])
+def test_a_sticking_valve_may_be_told_as_a_delay_in_some_cycles(
+    course: str, is_right: bool
+) -> None:
+    told = answer("response_delay")
+    told["causes"][0]["course"] = course
+    case = Case("unlisted", 1, "gripper", [STUCK], told)
+    assert case.found is is_right
+    assert case.outcomes["wrong"] is not is_right
+    assert case.stated == [(0.97, is_right)]
+    assert Case("unlisted", 1, "gripper", [STUCK], answer("x", "unlisted")).found
+
+
+def test_mechanisms_outside_the_table_are_counted_each() -> None:
+    ice = [replace(LEAK, effect="nozzle_icing")]
+    verdicts = ("unlisted", "unlisted", "explained", "consistent")
+    cases = [
+        Case("unlisted", seed, "gripper", ice, answer("leakage", verdict))
+        for seed, verdict in enumerate(verdicts)
+    ]
+    assert "| `nozzle_icing` | 4 | 2 | 1 | 1 |" in tables(cases)
+
+
+def test_each_mechanism_outside_the_table_takes_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    unit = battery_first.Unit("gripper", rig_of(shipped("gripper")), None)  # type: ignore[arg-type]
+    monkeypatch.setattr(battery_first, "unit", lambda *_: unit)
+    monkeypatch.setattr(battery_first, "recorded", lambda *_: None)
+    drawn = {
+        battery_first.drawn_case("unlisted", seed, 1)[1][0].effect
+        for seed in range(len(battery_first.OUTSIDE))
+    }
+    assert drawn == set(battery_first.OUTSIDE)
+
+
+def test_a_draw_is_compared_with_what_the_page_reached_where_that_is_short() -> None:
+    run = (
+        f"| {ASKED['named'].words} | 20 of 25 (80%) | |\n"
+        f"| {ASKED['pairs'].words} | 10 of 10 (100%) | |\n"
+        f"| {ASKED['wrong'].words} | 1 of 10 (10%) | |\n"
+    )
+    page = with_run(PAGE, "second", "a line", run)
+    assert expected("named", "second", page) == 0.8
+    assert expected("pairs", "second", page) == ASKED["pairs"].share
+    assert expected("wrong", "second", page) == 0.1
+    assert expected("spurious", "second", page) == ASKED["spurious"].share  # not in that run
 
 
 def test_ranks_of_true_sizes_are_uniform_where_intervals_are_right() -> None:
@@ -120,7 +190,6 @@ def test_ranks_of_true_sizes_are_uniform_where_intervals_are_right() -> None:
 def test_a_spurious_cause_is_one_beside_those_that_act() -> None:
     found, other = answer("leakage"), answer("sensor_gain")["causes"]
     assert single("leakage").outcomes["spurious"] is False
-    assert single("sensor_gain").outcomes["spurious"] is False  # that is wrong, and no extra
     case = Case("single", 7, "gripper", [LEAK], found | {"causes": found["causes"] + other})
     assert case.outcomes["spurious"] is True
 
@@ -144,7 +213,7 @@ def test_a_refusal_of_the_diagnosis_is_an_error_of_the_case(
         raise TwinError("no suction phase", "record more")
 
     one = battery_first.Unit("gripper", None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(battery_first, "drawn_case", lambda *_: (one, [LEAK], None))
+    monkeypatch.setattr(battery_first, "drawn_case", lambda *_, **__: (one, [LEAK], None))
     monkeypatch.setattr(battery_first, "diagnose", refused)
     case = battery_first.answered("single", 3, 1)
     assert (case.verdict, case.error) == ("error", "no suction phase")
@@ -179,7 +248,7 @@ def test_commissionings_are_told_by_verdict_phase_parameter_and_reason() -> None
 
 def test_chance_says_how_likely_so_few_are() -> None:
     cases = [Case("healthy", seed, "gripper", (), answer("x")) for seed in range(3)]
-    assert likely(cases, "consistent") == pytest.approx(0.03**3)
+    assert likely(cases, "consistent") == pytest.approx(0.02**3)
     right = Case("healthy", 9, "gripper", (), answer("x", "consistent"))
     assert likely([*cases, right], "consistent") > likely(cases, "consistent")
 
@@ -200,6 +269,17 @@ def test_a_run_that_was_cut_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert again.get("first", ("single", 7, 0)) is None
     again.add("first", replace(case, seed=8))
     assert [json.loads(line).get("seed") for line in path.read_text().splitlines()] == [None, 7, 8]
+
+
+def test_a_stored_run_is_counted_anew_under_its_own_commit(tmp_path: Path) -> None:
+    path, page = tmp_path / "cases.jsonl", tmp_path / "page.md"
+    page.write_text(PAGE, encoding="utf-8")
+    CaseFile(path, RUN).add("second", single("leakage"))
+    for _ in range(2):
+        recounted(path, page)
+    text = page.read_text(encoding="utf-8")
+    assert "second world, commit abc, seeds 7 to 7: found 1 of 1 single.**" in text
+    assert "commit abc" not in text.partition("<!-- older runs")[2]  # no run of its own twice
 
 
 def test_cases_of_another_run_are_not_mixed(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_a_log_whose_clock_begins_at_zero_is_told_in_seconds_since_its_beginning
     ],
 )
 def test_what_is_hidden_is_found(kind: str, seed: int) -> None:
-    case = battery_first.answered(kind, seed, 1)
+    case = battery_first.answered(kind, seed, 1, battery_first.UNLISTED)
     assert case.found, (case.verdict, case.named, case.error)
     assert not case.outcomes.get("wrong"), case.named
 

@@ -111,8 +111,9 @@ def test_weather_leaves_more_than_a_fault_and_comes_more_often() -> None:
 @pytest.mark.parametrize("seed", [830022, 830010])
 def test_a_mechanism_that_a_listed_cause_mimics_is_not_called_that_cause(seed: int) -> None:
     """Condensate, and a lip that lifts: a porous leak takes nearly all of either away."""
-    unit, hidden, samples = battery_first.drawn_case("unlisted", seed, 4)
-    assert hidden[0].effect in battery_first.UNLISTED
+    five = battery_first.UNLISTED
+    unit, hidden, samples = battery_first.drawn_case("unlisted", seed, 4, mechanisms=five)
+    assert hidden[0].effect in five
     found = diagnose(unit.config, [samples], "log", lambda _: None).json
     assert found["verdict"] == "unlisted"
     assert all(LEAST_SURE <= cause["probability"] < 0.7 for cause in found["causes"])

@@ -11,6 +11,10 @@ record and from what a person reads off it. Then effects are hidden in further r
 Without --first the first seed is drawn at random. With --cases each case is stored in FILE as soon
 as it is answered, and an interrupted run resumes. Prints a line for each case, and the tables.
 --write puts the tables into the page. Exits with 1 if a figure misses its target.
+
+    python tools/battery.py --recount FILE.jsonl [--write docs/battery.md]
+
+counts the stored cases of a complete run anew and runs nothing.
 """
 
 import argparse
@@ -22,7 +26,7 @@ from itertools import islice
 from pathlib import Path
 
 from tools import battery_first, battery_second
-from tools.battery_cases import Case, CaseFile, first_of
+from tools.battery_cases import Case, CaseFile, first_of, read_cases
 from tools.battery_page import all_kept, summary, tables, with_run
 from tools.version import commit
 
@@ -71,6 +75,26 @@ def line(case: Case) -> str:
     )
 
 
+def shown(world: str, cases: Sequence[Case], when: str, measured: str, page: Path | None) -> None:
+    """Print the tables of a run, and put them into a page."""
+    head, run = summary(world, cases, when, measured), tables(cases)
+    print(f"\n{head}\n\n{run}\n")
+    if page is not None:
+        text = page.read_text(encoding="utf-8")
+        page.write_text(with_run(text, world, head, run), encoding="utf-8")
+
+
+def recounted(path: Path, page: Path | None) -> bool:
+    """Count a stored run anew, dated as its file; whether it reached all targets."""
+    run, stored = read_cases(path)
+    when, reached = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime)), True
+    for name in WORLDS:
+        if cases := [case for world, case in stored if world == name]:
+            shown(name, cases, when, run["commit"], page)
+            reached &= all_kept(cases)
+    return reached
+
+
 def main() -> int:
     """Run the battery; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -95,7 +119,10 @@ def main() -> int:
         "--records", type=int, default=battery_second.RECORDS, help="after a commissioning there"
     )
     parser.add_argument("--write", type=Path, metavar="FILE", help="page whose tables to replace")
+    parser.add_argument("--recount", type=Path, metavar="FILE", help="cases of a complete run")
     arguments = parser.parse_args()
+    if arguments.recount is not None:
+        return 0 if recounted(arguments.recount, arguments.write) else 1
     first = first_of(arguments.cases) if arguments.first is None else arguments.first
     first = secrets.randbelow(SEEDS) if first is None else first
     when, measured = time.strftime("%Y-%m-%d"), commit()  # before the run, which takes long
@@ -116,11 +143,7 @@ def main() -> int:
         if not cases:
             continue
         reached &= all_kept(cases)
-        head, run = summary(world, cases, when, measured), tables(cases)
-        print(f"\n{head}\n\n{run}\n")
-        if arguments.write is not None:
-            page = arguments.write.read_text(encoding="utf-8")
-            arguments.write.write_text(with_run(page, world, head, run), encoding="utf-8")
+        shown(world, cases, when, measured, arguments.write)
     if arguments.write is not None and arguments.cases is not None:
         # The run is complete, so its file must not be resumed.
         arguments.cases.rename(arguments.cases.with_stem(f"{arguments.cases.stem}-{first}"))

@@ -24,6 +24,8 @@ FOUND = {
 STORED = ("good", "usable")  # verdicts of a commissioning after which a unit has its twin
 MOST_LEFT = 1.2  # sigmas that an explanation may leave
 SURE = 0.95  # from this probability on a cause counts as stated surely
+# Mechanisms outside the table that a listed effect describes with a course: what is right as well.
+ALSO = {"sticking_valve": ("response_delay", "intermittent")}
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,25 @@ class Case:
     @property
     def stated(self) -> list[tuple[float, bool]]:
         """Probability of each cause of the answer, and whether it acts."""
-        effects = {truth.effect for truth in self.hidden}
-        return [(float(cause["probability"]), cause["effect"] in effects) for cause in self.causes]
+        return [
+            (float(cause["probability"]), self._acts(cause, cause["effect"]))
+            for cause in self.causes
+        ]
+
+    @property
+    def right_causes(self) -> list[bool]:
+        """Whether each cause of the answer acts, itself or by a look-alike."""
+        return [
+            any(self._acts(cause, name) for name in names)
+            for cause, names in zip(self.causes, self.sets, strict=True)
+        ]
+
+    def _acts(self, cause: Mapping[str, Any], effect: str) -> bool:
+        """Whether an effect with the course of a cause is among what is hidden."""
+        return any(
+            effect == truth.effect or ALSO.get(truth.effect) == (effect, cause["course"])
+            for truth in self.hidden
+        )
 
     @property
     def rank(self) -> float | None:
@@ -135,6 +154,10 @@ class Case:
             for name, outcome in _JUDGES[self.kind](self).items()
             if outcome is not None
         }
+        if self.kind != "commissioning":
+            outcomes["spurious"] = not all(self.right_causes)
+            if self.verdict == "explained":
+                outcomes["wrong"] = not any(self.right_causes)
         if sure := [acts for probability, acts in self.stated if probability >= SURE]:
             outcomes["sure"] = sure
         return outcomes
@@ -169,8 +192,6 @@ def _single(case: Case) -> Mapping[str, float | None]:
     return {
         "named": bool(sets) and truth.effect in sets[0] and len(sets[0]) <= 3,
         "alone": sets == [[truth.effect]],
-        "wrong": case.verdict == "explained" and not any(truth.effect in names for names in sets),
-        "spurious": _spurious(case),
         "course": None if cause is None else cause["course"] == truth.course,
         covered: _covers(cause, truth) if comparable else None,
     }
@@ -179,22 +200,18 @@ def _single(case: Case) -> Mapping[str, float | None]:
 def _pair(case: Case) -> Mapping[str, float | None]:
     """Two effects at once: each in the set of one of the causes."""
     effects = {truth.effect for truth in case.hidden}
-    strange = any(not effects & set(names) for names in case.sets)
-    return {
-        "pairs": all(any(effect in names for names in case.sets) for effect in effects),
-        "wrong": case.verdict == "explained" and strange,
-        "spurious": _spurious(case),
-    }
+    return {"pairs": all(any(effect in names for names in case.sets) for effect in effects)}
 
 
 def _healthy(case: Case) -> Mapping[str, float | None]:
     """A healthy record: consistent."""
-    return {"consistent": case.verdict == "consistent", "wrong": case.verdict == "explained"}
+    return {"consistent": case.verdict == "consistent"}
 
 
 def _unlisted(case: Case) -> Mapping[str, float | None]:
-    """An effect outside the table: unlisted."""
-    return {"unlisted": case.verdict == "unlisted"}
+    """An effect outside the table: unlisted, or explained by what describes it as well."""
+    described = case.verdict == "explained" and all(case.right_causes)
+    return {"unlisted": case.verdict == "unlisted" or described}
 
 
 def _commissioning(case: Case) -> Mapping[str, float | None]:
@@ -213,13 +230,6 @@ _JUDGES = {
     "pair": _pair,
     "unlisted": _unlisted,
 }
-
-
-def _spurious(case: Case) -> bool:
-    """Whether some causes are right, by themselves or by a look-alike, and another is not."""
-    effects = {truth.effect for truth in case.hidden}
-    acts = [bool(effects & set(names)) for names in case.sets]
-    return any(acts) and not all(acts)
 
 
 def _cause(case: Case, truth: Hidden) -> Mapping[str, Any] | None:

@@ -6,7 +6,7 @@ own healthy record. Then effect, course and size are drawn.
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -55,14 +55,14 @@ ON_GRIPPER = {
 }
 SIGNED = {"threshold_drift", "sensor_offset", "sensor_gain"}
 NEGATIVE = {"ambient_pressure"}
-UNLISTED = {
+UNLISTED = {  # of the live naming trial, and of the battery until 2026-11-29
     "lip_lift": (1.5, 8.0),
     "supply_swing": (0.4, 1.5),
     "condensate": (3.0, 12.0),
     "nozzle_icing": (10.0, 50.0),
     "sensor_backlash": (10.0, 50.0),
 }
-# Mechanisms outside the table that tools/mechanism_trial.py hides, in the unit of the first size.
+# All mechanisms outside the table, in the unit of the first size.
 OUTSIDE = UNLISTED | {
     "creeping_cup": (15.0, 90.0),
     "sticking_valve": (15.0, 60.0),
@@ -123,9 +123,16 @@ def fault(rng: np.random.Generator, plc: PlcSettings, hidden: Hidden) -> Fault:
 
 
 def drawn_case(
-    kind: str, seed: int, units: int, first_unit: int = 0
+    kind: str,
+    seed: int,
+    units: int,
+    first_unit: int = 0,
+    mechanisms: Collection[str] = tuple(OUTSIDE),
 ) -> tuple[Unit, list[Hidden], Samples]:
-    """One of ``units`` rigs from ``first_unit`` on, the hidden effects, and the log."""
+    """One of ``units`` rigs from ``first_unit`` on, the hidden effects, and the log.
+
+    Unlisted ``mechanisms`` take turns; with ``UNLISTED`` a case is that of before 2026-11-29.
+    """
     rng = np.random.default_rng([2026, seed, sorted(COUNTS).index(kind)])
     name = SYSTEMS[int(rng.integers(len(SYSTEMS)))]
     rig = unit(name, first_unit + int(rng.integers(units)))
@@ -138,15 +145,17 @@ def drawn_case(
         effects = rng.choice(list(SIZES), 2, replace=False)
         hidden = [Hidden(str(e), "constant", draw_size(rng, name, str(e), 0.4)) for e in effects]
     elif kind == "unlisted":
-        effect = list(UNLISTED)[seed % len(UNLISTED)]
+        effect = list(mechanisms)[seed % len(mechanisms)]
         hidden = [Hidden(effect, "constant", draw_size(rng, name, effect))]
     faults = [fault(rng, rig.plc, entry) for entry in hidden]
     return rig, hidden, recorded(rig.plc, CYCLES - 1, int(rng.integers(1 << 30)), faults)
 
 
-def answered(kind: str, seed: int, units: int) -> Case:
+def answered(
+    kind: str, seed: int, units: int, mechanisms: Collection[str] = tuple(OUTSIDE)
+) -> Case:
     """Draw a case of a kind and diagnose it."""
-    rig, hidden, samples = drawn_case(kind, seed, units)
+    rig, hidden, samples = drawn_case(kind, seed, units, mechanisms=mechanisms)
     begin, answer, error = time.process_time(), None, ""
     try:
         answer = diagnose(rig.config, [samples], "battery", _quiet).json

@@ -30,21 +30,19 @@ ASKED = {
     "commissioned": Asked("rigs commissioned without editing a number", 0.95),
     "true": Asked("refused for a reason that is true of the record", 1.0),
     "parameters": Asked("95 % interval covers a parameter, where the world has it", 0.90),
-    "named": Asked("single effects named first or in a set of at most three", 0.95),
+    "named": Asked("single effects named first or in a set of at most three", 0.98),
     "alone": Asked("named alone, no look-alike needed", 0.85),
-    "wrong": Asked("explained and wrong", 0.01, most=True),
-    "spurious": Asked(
-        "answers with a cause beside the true ones that does not act", 0.03, most=True
-    ),
+    "wrong": Asked("`explained` without a cause that acts, of all `explained`", 0.005, most=True),
+    "spurious": Asked("answers with a cause that does not act, of all answers", 0.03, most=True),
     "sure": Asked(f"causes stated with {SURE:.0%} or more that act", 0.95),
     "course": Asked("the course right, where named", 0.90),
     "covered": Asked("95 % interval covers the size", 0.90),
     "flows": Asked("95 % interval covers a flow or volume, the vessel's told a fifth off", 0.90),
     "left": Asked(f"leftover at most {MOST_LEFT} sigmas, where explained", 0.95),
     "gain": Asked("share of the achievable gain, mean, where explained", 0.90),
-    "pairs": Asked("pairs, both named", 0.85),
-    "consistent": Asked("healthy records called consistent", 0.97),
-    "unlisted": Asked("effects outside the table called unlisted", 0.85),
+    "pairs": Asked("pairs, both named", 0.90),
+    "consistent": Asked("healthy records called consistent", 0.98),
+    "unlisted": Asked("effects outside the table called unlisted", 0.92),
 }
 
 
@@ -59,11 +57,22 @@ def all_kept(cases: Sequence[Case]) -> bool:
     return all(kept(cases, name) for name in ASKED if spread(cases, name))
 
 
-def likely(cases: Sequence[Case], name: str) -> float:
-    """Probability of a count at least this bad if the true share equals the target."""
+def likely(cases: Sequence[Case], name: str, share: float | None = None) -> float:
+    """Probability of a count at least this bad if the true share is ``share``, or the target."""
     outcomes, target = spread(cases, name), ASKED[name]
     side = "greater" if target.most else "less"
-    return float(binomtest(round(sum(outcomes)), len(outcomes), target.share, side).pvalue)
+    true_share = target.share if share is None else share
+    return float(binomtest(round(sum(outcomes)), len(outcomes), true_share, side).pvalue)
+
+
+def expected(name: str, world: str, page: str) -> float:
+    """The share that a target asks for; what the world's newest run reached where that is short."""
+    target, run = ASKED[name], marked(f"newest run of the {world} world", page)[2]
+    row = re.search(rf"\| {re.escape(target.words)} \| (\d+) of (\d+) ", run)
+    if row is None:
+        return target.share
+    reached = int(row[1]) / int(row[2])
+    return max(target.share, reached) if target.most else min(target.share, reached)
 
 
 def summary(world: str, cases: Sequence[Case], when: str, commit: str) -> str:
@@ -98,6 +107,10 @@ def tables(cases: Sequence[Case]) -> str:
                 "most left",
             ),
             _effects(list(of_kind(cases, "single"))),
+        ),
+        table(
+            ("hidden, outside the table", "cases", *_OUTSIDE_VERDICTS),
+            _outside(list(of_kind(cases, "unlisted"))),
         ),
         table(
             (
@@ -182,7 +195,7 @@ def with_run(page: str, world: str, line: str, run: str) -> str:
     """The page with a world's new run; the line of the run it replaces moves to the older runs."""
     newest, older = marked(f"newest run of the {world} world", page), marked("older runs", page)
     before = newest[2].strip().split("\n", 1)[0].strip("*")
-    if before:
+    if before and before.partition(":")[0] != line.partition(":")[0]:  # not the same counted anew
         page = page.replace(older[0], f"{older[1]}- {before}\n{older[2]}{older[3]}")
     return page.replace(newest[0], f"{newest[1]}**{line}**\n\n{run}\n{newest[3]}")
 
@@ -206,7 +219,7 @@ def _figures(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
                 chance = f"{ends.low:.0%} to {ends.high:.0%}"
             word = "at most" if target.most else "at least"
             yes = "yes" if kept(cases, name) else "**no**"
-            yield target.words, reached, chance, f"{word} {target.share:.0%}", yes
+            yield target.words, reached, chance, f"{word} {100.0 * target.share:g}%", yes
 
 
 def _verdicts(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
@@ -293,6 +306,18 @@ def _effects(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
         explained = sum(case.verdict == "explained" for case in selected)
         leftover = f"{np.nanmax([0.0, *(case.left for case in selected)]):.2f}"
         yield f"`{effect}`", *map(str, counts), names or "–", str(explained), leftover
+
+
+def _outside(cases: Sequence[Case]) -> Iterator[Sequence[str]]:
+    for effect in sorted({case.hidden[0].effect for case in cases if case.hidden}):
+        verdicts = Counter(
+            case.verdict for case in cases if case.hidden and case.hidden[0].effect == effect
+        )
+        counts = (verdicts.total(), *(verdicts[name] for name in _OUTSIDE_VERDICTS))
+        yield f"`{effect}`", *map(str, counts)
+
+
+_OUTSIDE_VERDICTS = ("unlisted", "explained", "consistent")
 
 
 def _missed(cases: Sequence[Case]) -> Iterator[Sequence[str]]:

@@ -43,7 +43,7 @@ COUNTED = {  # from what counts in an answer to the words of its row
     "covered": ASKED["covered"].words,
 }
 # What every case of a kind counts for, whatever the answer: there they can be held side by side.
-OF_EACH_CASE = ("named", "first", "alone", "consistent", "unlisted", "wrong")
+OF_EACH_CASE = ("named", "first", "alone", "consistent", "unlisted")
 CHANCE = 0.05
 TOLD_EVERY = 100  # training records
 
@@ -132,11 +132,10 @@ def only_one_right(
         for twin_outcome, learned_outcome in outcomes
         if name in twin_outcome and name in learned_outcome
     ]
-    counts = (
+    return (
         sum(twin_outcome > learned_outcome for twin_outcome, learned_outcome in pairs),
         sum(twin_outcome < learned_outcome for twin_outcome, learned_outcome in pairs),
     )
-    return counts[::-1] if name == "wrong" else counts
 
 
 def who_wins(only: Mapping[str, tuple[int, int] | None]) -> str:
