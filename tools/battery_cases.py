@@ -112,6 +112,12 @@ class Case:
         ]
 
     @property
+    def unlisted(self) -> tuple[float, bool] | None:
+        """Probability of something unlisted, and whether the record has it; None without one."""
+        stated = (self.answer or {}).get("unmodelled_probability")
+        return None if stated is None else (float(stated), self.kind == "unlisted")
+
+    @property
     def right_causes(self) -> list[bool]:
         """Whether each cause of the answer acts, itself or by a look-alike."""
         return [

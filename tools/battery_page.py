@@ -145,7 +145,9 @@ def reliability(cases: Sequence[Case]) -> Iterator[str]:
         )
 
 
-def by_probability(stated: Sequence[tuple[float, bool]]) -> Iterator[str]:
+def by_probability(
+    stated: Sequence[tuple[float, bool]], what: str = "causes", right: str = "act"
+) -> Iterator[str]:
     """A table of stated probabilities and how often they are right, then the mean error."""
     rows = list[Sequence[str]]()
     for low, high, group in _by_probability(stated):
@@ -155,9 +157,9 @@ def by_probability(stated: Sequence[tuple[float, bool]]) -> Iterator[str]:
         bounds = f"{low:.0%} to {min(high, 1.0):.0%}"
         rows.append((bounds, str(len(group)), f"{mean:.1%}", f"{acts:.1%}", chance))
     if rows:
-        yield table(("probability stated", "causes", "mean", "act", "by chance"), iter(rows))
+        yield table(("probability stated", what, "mean", right, "by chance"), iter(rows))
         error = calibration_error(stated)
-        yield f"Expected calibration error: {error:.3f}, over {len(stated)} causes."
+        yield f"Expected calibration error: {error:.3f}, over {len(stated)} {what}."
 
 
 def calibration_error(stated: Sequence[tuple[float, bool]]) -> float:

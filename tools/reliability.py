@@ -5,8 +5,10 @@
     python -m tools.reliability [--live LIVE.jsonl …] [--cases CASES.jsonl …]
 
 A statement is a cause with its probability: offline each cause of an answer, live the first name of
-an alarm. It is right if that effect acts. Adds the statements of files to docs/reliability.json,
-and writes docs/reliability.md from the whole file. A run that is stored already is replaced.
+an alarm. It is right if that effect acts. A third kind is the probability of something unlisted in
+each answer: it is right if the record has an effect outside the table. Adds the statements of files
+to docs/reliability.json, and writes docs/reliability.md from the whole file. A run that is stored
+already is replaced.
 """
 
 import argparse
@@ -24,7 +26,13 @@ from tools.naming_trial import Watched
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 DATA = PAGE.with_suffix(".json")
 MARK = "reliability"
-KINDS = {"live": "first name of an alarm", "offline": "causes of a diagnosis"}
+UNLISTED = "unlisted"
+KINDS = {
+    "live": "first name of an alarm",
+    "offline": "causes of a diagnosis",
+    UNLISTED: "something unlisted in a diagnosis",
+}
+WORDS = {UNLISTED: ("diagnoses", "are right")}  # heads of its columns
 
 Stated = Sequence[tuple[float, bool]]
 
@@ -54,14 +62,13 @@ def live(path: Path) -> Iterator[Run]:
 def offline(path: Path) -> Iterator[Run]:
     """The statements of diagnoses in a file, a run for each world."""
     run, cases = read_cases(path)
+    commit, first = str(run["commit"]), int(run["first"])
     for world in sorted({world for world, _ in cases}):
-        stated = [
-            statement
-            for case_world, case in cases
-            if case_world == world
-            for statement in case.stated
-        ]
-        yield Run("offline", world, str(run["commit"]), int(run["first"]), stated)
+        of_world = [case for case_world, case in cases if case_world == world]
+        causes = [statement for case in of_world for statement in case.stated]
+        yield Run("offline", world, commit, first, causes)
+        unlisted = [case.unlisted for case in of_world if case.unlisted is not None]
+        yield Run(UNLISTED, world, commit, first, unlisted)
 
 
 def known() -> list[Run]:
@@ -85,11 +92,13 @@ def tables(runs: Sequence[Run]) -> str:
         name, stated = f"{KINDS[kind]}, {world} world", _all(selected)
         commits = ", ".join(f"{run.commit} ({len(run.stated)})" for run in selected)
         rows.append((name, *_line(stated)))
-        parts += [f"## {name.capitalize()}", f"Commits: {commits}.", *by_probability(stated)]
-    rows.append(("all", *_line(_all(runs))))
+        parts += [f"## {name.capitalize()}", f"Commits: {commits}."]
+        parts += by_probability(stated, *WORDS.get(kind, ()))
+    causes = _all(run for run in runs if run.kind != UNLISTED)
+    rows.append(("all causes", *_line(causes)))
     head = "statements", "how many", "right", f"stated with {SURE:.0%} or more", "of these right"
     lines = table((*head, "expected calibration error"), iter(rows))
-    return "\n\n".join([lines, "## All", *by_probability(_all(runs)), *parts])
+    return "\n\n".join([lines, "## All causes", *by_probability(causes), *parts])
 
 
 def _all(runs: Iterable[Run]) -> Stated:
