@@ -1,5 +1,6 @@
 """The trial of mechanisms: what it changes on a rig, how it scores, and that it resumes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,8 +8,24 @@ import rigs
 
 from tools import battery_first, battery_second, mechanism_trial
 from tools.battery_cases import Case, CaseFile, Hidden
-from tools.mechanism_trial import CONDENSATE, RIGHT, cases, is_right, is_worse, share, table
+from tools.mechanism_trial import (
+    CONDENSATE,
+    OF_VOLUME,
+    RIGHT,
+    SIZES,
+    cases,
+    holds_size,
+    is_right,
+    is_worse,
+    recounted,
+    reduces,
+    share,
+    summary,
+    table,
+    wrongly_sure,
+)
 from tools.mechanism_worlds import CHANGES, Change, changed_config, changed_rig
+from twin.model.effects import effect_of
 from twin.model.mechanism import PLACES, WHENS
 from twin.signals import BAR
 
@@ -39,6 +56,68 @@ def test_place_and_dependence_are_right_among_at_most_three() -> None:
     assert not is_right(case("lip_lift", "opening_above", *["seepage_above"] * 3))
     assert is_right(case("condensate", "line_gathered", world="second"))
     assert not is_right(case("condensate", "line_gathered"))
+
+
+def told(effect: str, size: float, name: str, world: str = "first", **sizes: list[float]) -> Case:
+    """A case whose mechanism is told with intervals."""
+    shown = {key: {"low95": low, "high95": high} for key, (low, high) in sizes.items()}
+    named = case(effect, name, world=world)
+    mechanism = {"name": name, "sentence": "It acts", "parameters": shown}
+    answer = {**(named.answer or {}), "unlisted": {"mechanism": mechanism}}
+    return replace(named, hidden=[Hidden(effect, "constant", size)], answer=answer)
+
+
+def test_a_size_counts_where_it_means_what_was_hidden() -> None:
+    assert holds_size(told("lip_lift", 3.9, "inflow_above", flow=[3.2, 4.5])) is True
+    assert holds_size(told("lip_lift", 5.0, "inflow_above", flow=[3.2, 4.5])) is False
+    assert holds_size(told("supply_swing", 1.3, "supply_swinging", drop=[-1.5, -1.1])) is True
+    assert holds_size(told("lip_lift", 3.9, "seepage_above", flow_at_600mbar=[3.2, 4.5])) is None
+    gathered = told("sensor_thermal_drift", 18.7, "sensor_gathered", offset=[10.0, 20.0])
+    assert holds_size(gathered) is None  # another way of acting
+    leak = ("blow_off_valve_leak", 2.0, "inflow_always")
+    assert holds_size(told(*leak, flow=[1.0, 3.0])) is True
+    assert holds_size(told(*leak, world="second", flow=[1.0, 3.0])) is None
+    for effect, places in SIZES.items():
+        for place, parameter in places.items():
+            known = PLACES[place].parameters if place in PLACES else effect_of(place).parameters
+            assert parameter in {p.name for p in known}
+            assert effect == "sticking_valve" or place in RIGHT[effect][0]
+    assert set(SIZES) >= OF_VOLUME
+
+
+def test_a_sticking_valve_has_the_size_of_its_delay_and_no_other_cause_is_right() -> None:
+    delay = {"delay": {"low95": 20.0, "high95": 50.0}}
+    cause = {"effect": "response_delay", "course": "intermittent", "not_separable_from": []}
+    stuck = told("sticking_valve", 30.0, "")
+    stuck = replace(stuck, answer={"verdict": "explained", "unlisted": None})
+    sure = {"causes": [cause | {"parameters": delay, "probability": 0.96}]}
+    named = replace(stuck, answer={**(stuck.answer or {}), **sure})
+    assert holds_size(named) is True
+    assert wrongly_sure(named) == []
+    mimicked = replace(named, hidden=[Hidden("lip_lift", "constant", 30.0)])
+    assert wrongly_sure(mimicked) == ["response_delay"]
+    doubted = {"causes": [cause | {"parameters": delay, "probability": 0.9}]}
+    assert wrongly_sure(replace(mimicked, answer={**(stuck.answer or {}), **doubted})) == []
+
+
+def test_a_case_counts_if_it_holds_under_all_other_conditions() -> None:
+    judged = {"same": [10.0, 9.0, 1.0], "suction × 2": [10.0, 2.0, 1.0]}
+    held = replace(case("lip_lift"), more={"judged": judged, "world": "first"})
+    assert reduces(held) is True
+    judged = judged | {"volume − 30 %": [10.0, 5.0, 1.0], "supply + 1 bar": [1.0, 1.0, 1.0]}
+    assert reduces(replace(held, more={"judged": judged, "world": "first"})) is False
+    assert reduces(replace(held, more={"world": "first"})) is None
+    text = summary([told("lip_lift", 3.9, "inflow_above", flow=[3.2, 4.5])])
+    assert "In 1 of 1 cases it has that share" in text
+    assert "holds the true one in 1 of 1 cases" in text
+    assert "with 95% or more in 0 of 1 cases" in text
+
+
+def test_a_stored_run_is_scored_anew(tmp_path: Path) -> None:
+    file = CaseFile(tmp_path / "cases.jsonl", {"first": 1, "commit": "abc"})
+    file.add("second", Case("commissioning", 1, "gripper"))
+    stored = file.add("second", case("lip_lift", world="second"))
+    assert recounted(tmp_path / "cases.jsonl") == {"first": [], "second": [stored]}
 
 
 def test_shares_are_of_what_can_be_reached() -> None:
