@@ -152,6 +152,43 @@ def test_it_is_taken_in_for_a_type_and_comes_with_each_unit(
     assert config.data.hash == before.data.hash  # the same pressures are expected
 
 
+def catalogue_of(url: str, unit: str, kind: str = KIND) -> list[str]:
+    document = Document.parse(f'[asset]\ntype = "{kind}"\nid = "{unit}"\n', "cell.toml")
+    return list(Config.of(document, url, unit).data.catalogue)
+
+
+def test_for_one_unit_it_is_taken_in_there_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url, file = f"sqlite:///{tmp_path / 'assets.sqlite'}", proposal(tmp_path)
+    target = ("--untested", "--assets", url, "--id", "gripper-01")
+    assert twin(monkeypatch, "effects", "add", file, *target) == 0
+    assert "gripper-01: lifting_lip added" in capsys.readouterr().out
+    assert catalogue_of(url, "gripper-01") == ["lifting_lip"]
+    assert catalogue_of(url, "another") == []
+
+
+def test_for_a_site_it_is_taken_in_for_each_of_its_types(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url, file = f"sqlite:///{tmp_path / 'assets.sqlite'}", proposal(tmp_path)
+    with open_assets(tmp_path / "assets.sqlite") as database:
+        database.add(replace(database.get(KIND).record, name="larger", type="larger"))
+    assert twin(monkeypatch, "effects", "add", file, "--untested", "--assets", url, "--site") == 0
+    said = capsys.readouterr().out
+    for kind in (KIND, "larger"):
+        assert f"{kind}: lifting_lip added" in said
+        assert catalogue_of(url, "new", kind) == ["lifting_lip"]
+    assert catalogue_of(url, "gripper-01") == ["lifting_lip"]  # from its type
+
+
+def test_it_is_taken_in_for_one_of_unit_type_and_site(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = ("--untested", "--site", "--id", "gripper-01")
+    assert twin(monkeypatch, "effects", "add", proposal(tmp_path), *both) == 2
+
+
 def test_its_name_is_known_wherever_a_configuration_is() -> None:
     """An answer from another process names it: whoever puts that into words has only this."""
     config = rigs.config("gripper")

@@ -3,6 +3,9 @@
 import re
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rigs
+import tomli_w
+from command_line import twin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +22,8 @@ from drivers.plc.settings import PlcSettings
 from tools import battery_first
 from tools.calibration_coverage import recorded
 from tools.mechanism_worlds import Change, changed_plc
+from twin.config import Config
+from twin.diagnosis import answer as answer_module
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
@@ -25,6 +32,8 @@ from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
 from twin.diagnosis.propose import Proposal, _range, proposed
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
+from twin.live import Twin
+from twin.log.recorder import Recorder
 from twin.model import kernel
 from twin.model import mechanism as m
 from twin.model import theta as c
@@ -32,7 +41,8 @@ from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply, effect_of
 from twin.model.theta import Theta
-from twin.signals import MBAR, Command
+from twin.settings import Document
+from twin.signals import MBAR, Command, Samples
 
 FIVE = battery_first.UNLISTED  # the mechanisms that the seeds below were drawn from
 ROWS = 7000
@@ -254,6 +264,50 @@ def test_what_one_unit_had_is_named_on_another(tmp_path: Path) -> None:
     known = extended(told, another.config)
     assert known is not None
     assert list(known.data.effects) == [proposal.effect.mechanism]  # read without the catalogue
+
+
+@pytest.mark.slow
+def test_what_a_log_shows_is_proposed_tested_and_stored_by_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Log, proposal, catalogue. The diagnosis that proposes is shared; the tests of it are not."""
+    unit, _, diagnosis = iced()
+    log, moved = tmp_path / "ice.mcap", tmp_path / "archive.mcap"
+    with closing(Recorder(log, unit.config.log_header())) as recorder:
+        for rows, ticks in Twin.of(unit.config.data).over([diagnosis.evidence.samples]):
+            recorder.write(rows, ticks)
+
+    def known(config: Config, blocks: Iterable[Samples], *_: object, **__: object) -> Diagnosis:
+        read = np.concatenate(list(blocks))
+        assert np.allclose(read["pressure"], diagnosis.evidence.samples["pressure"], atol=1.0)
+        assert config.data.hash == unit.config.data.hash
+        return diagnosis
+
+    file = tmp_path / "ice_in_the_nozzle.toml"
+    with monkeypatch.context() as shared:
+        shared.setattr(answer_module, "diagnose", known)
+        assert twin(monkeypatch, "diagnose", log, "--propose", file) == 0
+    assert f"twin effects add {file}" in " ".join(capsys.readouterr().out.split())
+    log.rename(moved)
+
+    proposal = Proposal.read(file)
+    url = f"sqlite:///{tmp_path / 'assets.sqlite'}"
+    narrow = tmp_path / "narrow.toml"
+    tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    for size in tables["effect"]["parameters"].values():  # as if it hardly acted, and at once
+        low = size["low"]
+        size |= {"high": low + 0.02 * (size["found"] - low), "found": low}
+    narrow.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    assert twin(monkeypatch, "effects", "add", narrow, "--log", moved, "--assets", url) == 2
+    assert "does not name it: " in capsys.readouterr().err
+    assert not (tmp_path / "assets.sqlite").exists()
+
+    assert twin(monkeypatch, "effects", "add", file, "--log", moved, "--assets", url) == 0
+    said = capsys.readouterr().out
+    assert f"ice_in_the_nozzle is named on {moved}" in said
+    assert f"{unit.config.asset.type}: ice_in_the_nozzle added" in said
+    document = Document.parse(f'[asset]\ntype = "{unit.config.asset.type}"\nid = "x"\n', "x")
+    assert Config.of(document, url).data.catalogue == {"ice_in_the_nozzle": proposal.effect}
 
 
 @cache
