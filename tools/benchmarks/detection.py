@@ -1,4 +1,4 @@
-"""Change detection over cycles: false alarms, and delay compared with an optimal CUSUM.
+"""Change detection over cycles: delay compared with an optimal CUSUM.
 
 Healthy cycles of the simulated rig go through twin, bank and isolation as in the loop. Then a shift
 (sigmas) is added to scores of these cycles, drawn at random. The effect's own score gets all of it,
@@ -33,7 +33,6 @@ PROGRAM = {"suction_ms": 900.0, "blow_off_ms": 150.0, "idle_ms": 250.0}  # short
 CYCLE_S = 1.3
 DEVICES, LONG_DEVICES, CYCLES = 4, 40, 2600  # cycles of each device
 SETTLED = 200  # cycles after which a device's scores are stationary
-ASKED = (1000.0, 10_000.0)  # cycles to a false alarm
 MONTH = 30 * 86_400.0 / 3.0  # cycles to a false alarm: 30 days of 3 s cycles
 SHIFTS = (0.5, 1.0, 2.0)  # sigmas a cycle
 EFFECTS = ("leakage", "suction_loss", "filter_clogging", "threshold_drift", "sensor_lag")
@@ -44,19 +43,18 @@ NEVER = 4000  # cycles
 
 
 def sums(run: Run) -> Sequence[Measured]:
-    """False alarms at two wanted rates, and delays for three sizes, beside the optimum.
+    """Delays for three sizes, beside the optimum.
 
     First the delays of settled sums, then those of sums that begin with the change.
     """
     devices = LONG_DEVICES if run.long else DEVICES
     scores, cosines = _simulated(run, devices)
-    false = [_false_alarms(scores, cosines, cycles) for cycles in ASKED]
     pool = np.concatenate([device_scores[SETTLED:] for device_scores in scores])
     run.tell("detection: delays")
     running, fresh = _running(pool, cosines), [_changes(cosines)] * DRAWS
     late = [_late(pool, cosines, shift, running, RUN_IN) for shift in SHIFTS]
     later = [_late(pool, cosines, shift, fresh, 0) for shift in SHIFTS]
-    return (*false, *late, *later)
+    return (*late, *later)
 
 
 def _simulated(run: Run, devices: int) -> tuple[list[Floats], Floats]:
@@ -85,21 +83,6 @@ def _changes(cosines: Floats) -> ChangeDetector:
     detector = looked_for()
     detector.weigh(cosines)
     return detector
-
-
-def _false_alarms(devices: Sequence[Floats], cosines: Floats, wanted: float) -> Measured:
-    """False alarms over the wanted number; ``wanted`` is in cycles to a false alarm."""
-    alarms, cycles = 0, 0
-    for scores in devices:
-        detector = _changes(cosines)
-        for normal in scores:
-            detector.take(normal)
-            if detector.log_sum >= limit(wanted):
-                alarms += 1
-                detector.begin()
-        cycles += len(scores)
-    note = f"({alarms} in {cycles:,} cycles)"
-    return Measured([alarms * wanted / cycles], note=note)
 
 
 def _running(pool: Floats, cosines: Floats) -> list[ChangeDetector]:
