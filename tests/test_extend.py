@@ -323,7 +323,8 @@ def test_terms_that_data_gave_are_in_it(evidence: Evidence) -> None:
     before = rigs.config("test_rig").monitor.healthy.figures["suction_mean"]
     assert abs(known.healthy.figures["suction_mean"].mean - before.mean) > 10.0  # no such term is
     (remark,) = remarks(unlisted)
-    assert remark == "the term from data holds for this program of commands only"
+    assert remark.startswith("the curve from data holds for this program of commands only")
+    assert "where the program changes, go back to the data set without it" in remark
 
 
 def test_without_a_term_what_nobody_listed_is_said_to_be_missing(evidence: Evidence) -> None:

@@ -53,8 +53,8 @@ class Subject:
 
 def changed_config(config: Config, change: Change) -> Config:
     """The configuration as a person who makes this change on the rig would change it."""
-    tables = config.data.model_dump()
-    tables["supply"]["pressure_bar"] += change.supply_bar
+    supply_bar = config.data.supply.pressure_bar + change.supply_bar
+    tables = config.data.at_supply(supply_bar).model_dump()
     end = tables["system"]["parts"][-1]
     end["volume_ml"] *= change.volume
     if end["wall_area_cm2"] is not None:

@@ -25,6 +25,7 @@ from twin.cli.options import (
 )
 from twin.cli.options import output as output_option
 from twin.cli.setup import settings_of
+from twin.errors import ConfigError
 from twin.files import require_writable, write_json, write_whole
 from twin.languages.choice import language_of
 from twin.languages.texts import ENGLISH
@@ -32,6 +33,7 @@ from twin.languages.texts import ENGLISH
 if TYPE_CHECKING:
     from twin.config import Config
     from twin.diagnosis.answer import Diagnosis
+    from twin.log.header import LogHeader
 
 
 def diagnose(
@@ -50,7 +52,10 @@ def diagnose(
     ] = "",
     judge_on: Annotated[
         Path | None,
-        typer.Option(metavar="OTHER.mcap", help="Measure the gain on another log as well."),
+        typer.Option(
+            metavar="OTHER.mcap",
+            help="Measure the gain on another log of it as well, under its supply and parts.",
+        ),
     ] = None,
     propose: Annotated[
         Path | None,
@@ -80,6 +85,13 @@ def diagnose(
     settings = settings_of(recorded.header, log, config, assets, unit, as_of, to_store=store)
     if not unit:
         settings.refuse_another(recorded.header, str(log))
+    there = None
+    if other_log is not None and judge_on is not None:
+        from twin.diagnosis.another_log import conditions
+
+        _refuse_another_asset(recorded.header, other_log.header, judge_on)
+        named = (str(log), recorded.header), (str(judge_on), other_log.header)
+        there = conditions(settings, *named)
     with status() as say:
         derived = recorded.header.derived
         diagnosis = find_cause(settings, recorded.samples, str(log), say, derived=derived)
@@ -88,7 +100,8 @@ def diagnose(
 
             say(f"judging on {judge_on}")
             rows = other_log.samples
-            diagnosis.json["judged_on"] = judged_on(diagnosis, settings, str(judge_on), rows)
+            judged = judged_on(diagnosis, settings, str(judge_on), rows, there)
+            diagnosis.json["judged_on"] = judged
     print(lines(diagnosis.json, time.time_ns()))
     if other_log is not None:
         from twin.diagnosis.extend import nothing
@@ -106,6 +119,17 @@ def diagnose(
         _save(diagnosis, settings, save_as, assets, log)
     if propose is not None:
         _propose(diagnosis, settings, log, propose)
+
+
+def _refuse_another_asset(header: "LogHeader", other: "LogHeader", log: Path) -> None:
+    """ConfigError if the log to judge on is of another asset."""
+    own, others = ((one.asset_type, one.asset_id) for one in (header, other))
+    if all((*own, *others)) and own != others:
+        raise ConfigError(
+            f"{log} is a log of {' '.join(others)}, not of {' '.join(own)}: a cause that was found"
+            " on one unit cannot be judged on another",
+            "take another log of the same unit; twin effects add carries what was found to others",
+        )
 
 
 def _save(diagnosis: "Diagnosis", settings: "Config", unit: str, assets: str, log: Path) -> None:

@@ -70,7 +70,10 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
     if any(map(swings, diagnosis.acting)):
         yield "what swings begins anew in each recording: it is not stored"
     if diagnosis.terms:
-        yield "the term from data holds for this program of commands only"
+        yield (
+            "the curve from data holds for this program of commands only, and is added to any:"
+            " where the program changes, go back to the data set without it"
+        )
     elif diagnosis.json["verdict"] == "unlisted" and not diagnosis.mechanism:
         yield "what no listed effect explains is not in it"
 

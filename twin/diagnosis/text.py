@@ -178,9 +178,11 @@ def on_another_log(answer: Answer, nothing: str) -> str:
         for key, _, short, unit in FIGURES
     )
     reduction = f"{number(judged['gain']['rms_reduction_pct'])} % less rms deviation"
+    left_out = f"\n  {'left out':<14} {judged['left_out']}" if judged["left_out"] else ""
     return (
         f"  {'another log':<14} {judged['log']}, {cycles} cycles on which nothing was chosen:"
         f" {figures}\n  {'gain there':<14} {reduction} ({gain_interval(judged['gain'], cycles)})"
+        f"{left_out}"
     )
 
 

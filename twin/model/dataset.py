@@ -28,6 +28,7 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
+LEAST_SHARE = 1e-3  # of suction at its optimum supply, as in the plant
 AFTER_BLOW_OFF = -5e5  # Pa of vacuum, which no blow-off reaches: the part goes when it ends
 SHORTEST_SWING = 5e-3  # s, shortest period of a line that samples at 1 kHz show
 UNSEEN_SWING = 3.5e-3  # s, longest period of a line that they do not show at all
@@ -297,6 +298,29 @@ class DataSet(Settings):
         if self.ejector.h1_mbar >= ambient:
             raise ValueError("ejector.h1_mbar must be below ambient.pressure_mbar: it is a vacuum")
         return self
+
+    def at_supply(self, pressure_bar: float) -> "DataSet":
+        """The data set at another operating pressure (bar gauge), by its own laws of the supply.
+
+        Suction, end pressure and blow-off are those at the pressure of the data set, so they are
+        converted. ValidationError if nothing is left of them.
+        """
+        supply, ejector = self.supply, self.ejector
+        drop = supply.pressure_bar - pressure_bar
+        before, after = supply.nozzle_bar, supply.nozzle_bar - drop
+        peaks = [
+            1.0 - supply.curvature * (nozzle / supply.optimum_bar - 1.0) ** 2
+            for nozzle in (before, after)
+        ]
+        ambient = self.ambient.pressure_mbar * MBAR / BAR
+        rises = 1.0 + ejector.end_follows_supply * supply.end_pressure_slope * drop
+        tables = self.model_dump()
+        tables["supply"]["pressure_bar"] = pressure_bar
+        tables["supply"]["end_pressure_slope"] /= max(rises, LEAST_SHARE)
+        tables["ejector"]["suction_capacity_sl_min"] *= peaks[1] / max(peaks[0], LEAST_SHARE)
+        tables["ejector"]["end_pressure_mbar"] *= rises
+        tables["ejector"]["blow_off_sl_min"] *= (after + ambient) / (before + ambient)
+        return DataSet.model_validate(tables)
 
     @property
     def hash(self) -> str:
