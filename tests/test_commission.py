@@ -17,6 +17,7 @@ from second_world.draw import draw_rig
 from second_world.faults import Fault
 from second_world.records import Record as Logged
 from second_world.records import record
+from test_retelling import ENGLISH_WORDS, in_german
 
 from twin.assets.database_url import open_chosen
 from twin.calibration.calibrate import complete
@@ -548,6 +549,9 @@ def refused(samples: Samples) -> str:
     with pytest.raises(ConfigError) as error:
         commission(typed("gripper"), [samples], quiet)
     assert error.value.hint
+    for text in (str(error.value), error.value.hint):
+        assert in_german(text) != text
+        assert not ENGLISH_WORDS.search(in_german(text))
     return str(error.value)
 
 
@@ -618,6 +622,19 @@ def test_no_suction_is_refused() -> None:
     samples = log_of("gripper").copy()
     samples["commands"] = 0
     assert "no suction" in refused(samples)
+
+
+def test_what_is_missing_or_spoilt_in_many_rows_is_refused() -> None:
+    whole = log_of("gripper")
+    assert "% of the record's rows are missing" in refused(whole[np.arange(len(whole)) % 4 > 0])
+    spoilt = whole.copy()
+    spoilt["quality"][100 : len(whole) // 20] |= np.uint8(Quality.BAD)
+    assert "saturated, stale or bad in" in refused(spoilt)
+    holes = whole.copy()
+    holes["quality"][500::500] |= np.uint8(Quality.GAP)
+    holes["time_ns"] += np.arange(len(whole)) // 500 * 10_000_000
+    assert "gaps and 0 cycles without one" in refused(holes)
+    assert "complete cycles that count; commissioning needs 5" in refused(whole[: len(whole) // 3])
 
 
 def test_missing_rows_leave_a_record_that_can_be_fitted() -> None:

@@ -1,6 +1,7 @@
 """Pages of a commissioning and of a fleet: German throughout, and fit for keyboard and phone."""
 
 import io
+import json
 import re
 from pathlib import Path
 from typing import Literal
@@ -25,6 +26,7 @@ from twin.diagnosis.report import write_report
 from twin.diagnosis.retelling import templates
 from twin.fleet.report_page import write_page as write_fleet
 from twin.languages.choice import language_of
+from twin.log.header import DERIVED
 from twin.log.recorder import Recorder
 from twin.signals import TICK
 
@@ -89,6 +91,44 @@ def test_a_commissioning_writes_its_page_in_the_language_that_was_asked_for(
     assert twin(monkeypatch, *command, "--language", "de") == 2  # as it is refused
     assert "refused: the twin is off by more" in capsys.readouterr().out  # the terminal is English
     assert "Abgelehnt – compact-ejector-35 gripper-7" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("derived", [False, True])
+def test_a_record_that_is_refused_before_its_fit_leaves_its_answer_and_its_page(
+    derived: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    log, page, answer = (Path(f"a.{ending}") for ending in ("mcap", "html", "json"))
+    metadata = {DERIVED: derived_commands()} if derived else None
+    recorder = Recorder(log, rigs.config("test_rig").log_header(metadata))
+    samples = log_of("test_rig")[:1000].copy()
+    samples["commands"] = 0
+    recorder.write(samples, np.zeros(len(samples), TICK), [])
+    recorder.close()
+    command = ("commission", log, "--id", "rig-7", "-o", page, "--json", answer)
+    assert twin(monkeypatch, *command, "--language", "de") == 2
+    stored = json.loads(answer.read_text(encoding="utf-8"))
+    assert (stored["verdict"], stored["record"]) == ("refused", None)
+    assert stored["asset"]["id"] == "rig-7"
+    said = capsys.readouterr().err
+    assert stored["reason"] in said
+    assert stored["do"] in said
+    written = page.read_text(encoding="utf-8")
+    assert "Abgelehnt – compact-ejector-35 rig-7" in written
+    assert "Nichts wird gespeichert." in written
+    assert ENGLISH_WORDS.findall(visible(written)) == []
+    why = "aus dem Druck abgeleitet: 8-mal Saugen" if derived else "wird nie gesaugt. Prüfen"
+    assert why in written
+
+
+def derived_commands() -> str:
+    return (
+        "suction and blow-off derived from the pressure: 8 suctions; releases go above the level of"
+        " idle, so they are called blow-off; valve delays and the timing of commands cannot be told"
+    )
 
 
 def test_the_verdict_says_what_follows_in_german(tmp_path: Path) -> None:

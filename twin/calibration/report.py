@@ -8,6 +8,7 @@ from twin.calibration.commission import Commissioned
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
 from twin.diagnosis.text import spoken
+from twin.errors import TwinError
 from twin.languages.texts import numeral, tr
 from twin.signals import MBAR, MS, Phase
 
@@ -181,4 +182,16 @@ def commissioned_as_json(
         "cycles": commissioned.calibration.cycles,
         "parameters": parameters(commissioned.calibration),
         "data": fitted.data.model_dump(),
+    }
+
+
+def refusal_as_json(error: TwinError, asset: Asset) -> dict[str, Any]:
+    """The refusal for programs; it has the same first keys as a commissioning."""
+    return {
+        "format": "ejector-twin-commissioning/1",
+        "asset": {"type": asset.type, "id": asset.id},
+        "record": None,
+        "verdict": "refused",
+        "reason": str(error),
+        "do": error.hint,
     }

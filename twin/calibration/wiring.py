@@ -54,16 +54,17 @@ def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> Non
 
 def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
     """ConfigError with the reason for a rise in suction: reference, sign or commands."""
-    highest = f"{readings.highest / MBAR:.0f} mbar absolute"
+    highest = f"{readings.highest / MBAR:.0f}"
     if readings.deepest < NEVER_OPENED * ambient and readings.highest < ambient:
         raise ConfigError(
-            f"the pressure rises to {highest} while suction is commanded, from about zero: it is"
-            " vacuum, taken for absolute pressure",
+            f"the pressure rises to {highest} mbar absolute while suction is commanded, from about"
+            " zero: it is vacuum, taken for absolute pressure",
             f'set reference = "vacuum" of {TAG}',
         )
     if readings.highest - ambient > ambient - readings.deepest:
         raise ConfigError(
-            f"the pressure rises to {highest} while suction is commanded: its sign is wrong",
+            f"the pressure rises to {highest} mbar absolute while suction is commanded: its sign is"
+            " wrong",
             f'set reference = "gauge" (falls in suction) or "vacuum" (rises) of {TAG}',
         )
     raise ConfigError(

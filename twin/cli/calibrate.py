@@ -1,36 +1,15 @@
-"""``twin calibrate`` and ``twin commission``: a unit's data set from healthy cycles."""
+"""``twin calibrate``: a unit's data set from healthy cycles, if its type is known."""
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from twin.cli.app import say_if_cut, say_if_new
 from twin.cli.console import status
-from twin.cli.options import (
-    JSON,
-    PAGE,
-    AssetsUrl,
-    ConfigOption,
-    JsonAlone,
-    JsonFile,
-    LanguageCode,
-    LogFile,
-    PageFile,
-    UnitId,
-    chosen,
-)
-from twin.cli.options import output as output_option
-from twin.cli.stopping import closed
+from twin.cli.options import AssetsUrl, JsonAlone, LogFile, UnitId
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
-from twin.languages.choice import language_of
-from twin.languages.texts import ENGLISH
-
-if TYPE_CHECKING:
-    from twin.settings import Document
-    from twin.signals import Samples
 
 
 def calibrate(
@@ -64,91 +43,3 @@ def calibrate(
     print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
     if json_file is not None:
         write_json(json_file, as_json(calibration, record))
-
-
-def commission(
-    source: Annotated[
-        Path, typer.Argument(metavar="LOG.mcap|CONFIG", help="A record, or the unit's PLC.")
-    ],
-    *,
-    unit: UnitId = "",
-    config: ConfigOption = None,
-    cycles: Annotated[
-        int, typer.Option(metavar="N", help="How many cycles to record from a PLC.")
-    ] = 12,
-    assets: AssetsUrl = "",
-    output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
-    json_file: JsonFile = None,
-    report: PageFile = None,
-    language: LanguageCode = ENGLISH.code,
-) -> None:
-    """Fit a unit that nobody has seen before to a record of healthy cycles, and store it.
-
-    The configuration says what hangs on the ejector; a fifth off is near enough. The record
-    corrects it where they differ. The verdict is good, usable or refused (exit code 2).
-    """
-    from twin.calibration.commission import commission as fit_unit
-    from twin.calibration.report import commissioned_as_json, commissioned_in_words
-    from twin.calibration.save import store_first
-    from twin.config import Config, document_in
-    from twin.log.reader import open_log
-    from twin.settings import Document
-
-    json_file = chosen(output, "--json", json_file, JSON)
-    report = chosen(output, "--report", report, PAGE)
-    require_writable(json_file, report)
-    report_language = language_of(language, "--language")
-    recorded = None if source.suffix == ".toml" else open_log(source)
-    if recorded is not None:
-        recorded.header.require_commands(str(source))
-        say_if_cut(recorded, source, "used")
-    if recorded is None or config is not None:
-        document = Document.read(config or source)
-    else:
-        document = document_in(recorded.header)
-    settings = Config.of(document, assets, unit, calibrated=False)
-    if recorded is not None:
-        settings = settings.of_rows(recorded.header)
-    if not settings.asset.id:
-        raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
-    with status() as say:
-        blocks = (
-            (rows for rows, _ in recorded.blocks())
-            if recorded is not None
-            else _recorded_cycles(document, cycles, say)
-        )
-        commissioned = fit_unit(settings, blocks, say)
-    print(commissioned_in_words(commissioned))
-    record = None
-    if commissioned.verdict.word != "refused":
-        say_if_new(assets, settings.document)
-        record, location = store_first(commissioned.calibration, settings, assets, source)
-        print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
-    if json_file is not None:
-        write_json(json_file, commissioned_as_json(commissioned, settings.asset, record))
-    if report is not None:
-        from twin.calibration.page import write_page  # with Matplotlib
-
-        write_page(commissioned, settings.asset, report, report_language)
-    if record is None:
-        raise typer.Exit(2)
-
-
-def _recorded_cycles(
-    document: "Document", cycles: int, say: "Callable[[str], None]"
-) -> "Iterator[Samples]":
-    """Blocks from the PLC until so many cycles have ended after the first, which may be partial."""
-    from drivers.sources import open_source
-    from twin.signals import Command
-
-    begun, before = 0, True
-    source = open_source(document)
-    with closed(source):
-        for block in source:
-            on = (block["commands"] & Command.SUCTION) != 0
-            for row in on.tolist():
-                begun, before = begun + (row and not before), row
-            say(f"recording: suction {min(begun, cycles + 2)} of {cycles + 2}")
-            yield block
-            if begun > cycles + 1:
-                return

@@ -12,8 +12,9 @@ import sys
 from twin.cli.alarms import alarms_app
 from twin.cli.app import App
 from twin.cli.assets import assets_app
-from twin.cli.calibrate import calibrate, commission
+from twin.cli.calibrate import calibrate
 from twin.cli.cert import cert
+from twin.cli.commission import commission
 from twin.cli.compare import compare
 from twin.cli.config import config_app
 from twin.cli.console import complain

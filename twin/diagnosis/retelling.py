@@ -108,13 +108,63 @@ _COMMISSIONING = (  # what a record corrects in the configuration, and the lines
     '[[data.system.parts]] kind = "sensor", after the tubes',
     '[[data.system.parts]] kind = "sensor", before the tubes',
 )
+_REFUSALS = (  # why a record cannot be commissioned, and what to do
+    "{log}: {derived}. A twin needs to know when valves were told",
+    "{commands} derived from the pressure: {suctions}; {releases}; valve delays and the timing of"
+    " commands cannot be told",
+    "record suction and blow-off beside the pressure, a row each 2 ms or faster; what needs no"
+    " twin: twin figures show LOG, twin compare A B",
+    "the record has no suction",
+    "check which tag or column is suction",
+    "the record has a row each {period} ms: the nozzle's switching and the valves' delays are not"
+    " seen in it",
+    "record again with a row each {slowest} ms or faster; what needs no twin: twin figures show"
+    " LOG, twin compare A B",
+    "{share}% of the record's rows are missing",
+    'record again in block mode (mode = "block"), which loses none',
+    "the fit ends at values that no ejector has: this is no record of the parts that [data.system]"
+    " lists, or of more than one unit",
+    "check volumes, tubes and the sensor's place; commission on a record of one unit",
+    "the pressure falls to {deepest} mbar absolute, and none is below zero: it is gauge pressure,"
+    " taken for absolute",
+    'set reference = "gauge" of [driver.tags.pressure], or of the column',
+    "the pressure is never above {highest} mbar absolute: too little, as ambient pressure is"
+    " {ambient}",
+    "check the unit of [driver.tags.pressure], or of the column: is it in kPa or psi?",
+    "the pressure idles at {idle} mbar absolute, and ambient pressure is {ambient}: it is absolute"
+    " pressure, taken for gauge",
+    'set reference = "absolute" of [driver.tags.pressure], or of the column',
+    "the pressure moves by {size} mbar only in the whole record: no vacuum is made",
+    "check the unit and the range of [driver.tags.pressure], or of the column",
+    "the pressure rises to {highest} mbar absolute while suction is commanded, from about zero: it"
+    " is vacuum, taken for absolute pressure",
+    'set reference = "vacuum" of [driver.tags.pressure], or of the column',
+    "the pressure rises to {highest} mbar absolute while suction is commanded: its sign is wrong",
+    'set reference = "gauge" (falls in suction) or "vacuum" (rises) of [driver.tags.pressure], or'
+    " of the column",
+    "the pressure rises while suction is commanded and falls while blow-off is: the two commands"
+    " are swapped",
+    "swap [driver.tags.suction] and [driver.tags.blow_off], or the two columns",
+    "after suction the pressure holds, then rises by {rise} mbar at once, and no row has blow-off"
+    " commanded: something lets air in that is not told",
+    "connect [driver.tags.blow_off], or the column blow_off, and record again",
+    "with cycle {cycle} of the record all changes, by {step} mbar rms, where cycles otherwise"
+    " differ by {usual}: it is of two units, or something was changed in the midst of it",
+    "commission on a record of one healthy unit in one state",
+    "the pressure is saturated, stale or bad in {share}% of the samples",
+    "check the sensor's range and wiring, then record again",
+    "the log has {breaks} gaps and {cycles} cycles without one",
+    "record again in block mode",
+    "the log has {cycles} complete cycles that count; commissioning needs {least}",
+    "record suction, blow-off and idle again and again without a gap",
+)
 _FLEETS = (  # why a unit of a fleet could not be judged
     "no cycle of its newest log can be compared",
     "{count} unit to compare, {needed} are needed; its newest log is not diagnosed yet",
     "{count} units to compare, {needed} are needed; its newest log is not diagnosed yet",
     "no diagnosis: {reason}",
 )
-_AS_WRITTEN = {"tag", "command"}  # values that a person types
+_AS_WRITTEN = {"tag", "command", "log"}  # values that a person types
 _SIZE = re.compile(r"([a-z][a-z0-9 ]*?) ([-+]?\d\S* \S+)")  # a name with its size
 
 
@@ -136,6 +186,7 @@ def templates() -> list[str]:
         *_SIGNALS,
         *_ALARMS,
         *_COMMISSIONING,
+        *_REFUSALS,
         *_FLEETS,
         *caution_words,
         *(text for when in WHENS.values() for text in (when.sentence, when.formula)),

@@ -1,0 +1,35 @@
+"""The page of a record that cannot be commissioned: the reason, and what to do."""
+
+import html
+from pathlib import Path
+
+from twin.calibration.page import MARKS
+from twin.config import Asset
+from twin.diagnosis import page
+from twin.diagnosis.retelling import retold
+from twin.diagnosis.text import capital
+from twin.errors import TwinError
+from twin.files import write_text
+from twin.languages.texts import ENGLISH, Language, language_code, speaking, tr
+
+
+def write_refusal(error: TwinError, asset: Asset, path: Path, language: Language = ENGLISH) -> None:
+    """Write the page, one HTML file; SourceError if it cannot be written."""
+    with speaking(language):
+        write_text(path, _page(error, asset))
+
+
+def _page(error: TwinError, asset: Asset) -> str:
+    mark, colour = MARKS["refused"]
+    word = capital(tr("refused"))
+    sentences = [capital(retold(text)) for text in (str(error), error.hint) if text]
+    return page.PAGE.substitute(
+        language=language_code(),
+        title=html.escape(tr("Commissioning of {unit}", unit=asset.id)),
+        colour=colour,
+        mark=mark,
+        verdict=html.escape(f"{word} – {asset.type} {asset.id}"),
+        headline=html.escape(tr("No twin was fitted to this record.")),
+        body=page.section(tr("Why"), page.paragraph(f"{'. '.join(sentences)}.")),
+        footer=tr("Nothing is stored."),
+    )
