@@ -98,7 +98,7 @@ def test_a_type_that_nobody_knows_begins_with_its_first_unit(tmp_path: Path) -> 
     config, log = config_of(logged(SEED, KIND).truth.readable), tmp_path / "log.mcap"
     log.write_bytes(b"a log")
     url = f"sqlite:///{tmp_path}/assets.sqlite"
-    record_, _ = store_first(commissioned().calibration, config, url, log)
+    record_, _ = store_first(commissioned(), config, url, log)
     with open_chosen(url, config.document, write=False) as database:
         kinds = database.records("type", UNKNOWN_TYPE)
         assert [kind.name for kind in kinds] == [UNKNOWN_TYPE]

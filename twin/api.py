@@ -301,7 +301,7 @@ class Commissioned(Calibrated):
         if self.verdict == "refused":
             verdict = calibration_report.headline(self._commissioning.verdict)
             raise ConfigError(verdict, "correct the configuration, or record healthy cycles")
-        record, _ = store_first(self._calibration, self.config, self._log.assets, self._log.path)
+        record, _ = store_first(self._commissioning, self.config, self._log.assets, self._log.path)
         return record
 
     def _samples(self) -> Samples:

@@ -8,7 +8,7 @@ asset database. Their origin is kept.
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 
+from twin.assets import provenance
 from twin.assets.diagram import FLOW, SUPPLY, VACUUM
 from twin.assets.record import Found, Record, UnknownAssetError
 from twin.errors import ConfigError, SourceError, known_names
@@ -102,6 +103,8 @@ class Config:
     log: LogSettings
     origin: str = HAND_WRITTEN  # origin of the data set, in words
     instead: str = ""  # what replaces the unit's missing data set, in words
+    # Phases that a usable twin follows less well than its record allowed, with times the floor.
+    weak: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -144,6 +147,9 @@ class Config:
         config = cls._checked(document, asset, layers, _origin(record, layers))
         if calibrated and not (record and record.used == "instance"):
             config = replace(config, instead=_instead(asset, record, database_name))
+        elif calibrated and record:
+            weak = provenance.weak_phases(record.record.provenance.get(provenance.WEAK))
+            config = replace(config, weak=weak)
         return config
 
     @classmethod
@@ -158,7 +164,8 @@ class Config:
         with _log_errors(metadata, log):
             document.refuse_unknown_tables(TABLES)
             asset = document.section(Asset, "asset")
-            return cls._checked(document, asset, stored, metadata.get("origin", "the log"))
+            config = cls._checked(document, asset, stored, metadata.get("origin", "the log"))
+            return replace(config, weak=_weak_in_log(metadata))
 
     @classmethod
     def of_recorded(
@@ -222,6 +229,7 @@ class Config:
             "data": self.data.model_dump_json(),
             "healthy": self.monitor.healthy.model_dump_json(),
             **({COUNTED_FROM: AMBIENT} if self.is_gauge else {}),
+            **({provenance.WEAK: json.dumps(dict(self.weak))} if self.weak else {}),
             **(unmeasured or {}),
         }
         return LogHeader(
@@ -512,6 +520,13 @@ def _stored_in_log(metadata: Mapping[str, str], log: str) -> Known:
         message = f"{log}: its data set cannot be used: {problem}"
         raise SourceError(message, _log_hint(metadata))
     return content
+
+
+def _weak_in_log(metadata: Mapping[str, str]) -> dict[str, float]:
+    """Weak phases of the twin of a recording; none if the log has nothing that can be read."""
+    with suppress(ValueError, RecursionError):
+        return provenance.weak_phases(json.loads(metadata.get(provenance.WEAK, "{}")))
+    return {}
 
 
 def _in_words(error: ValidationError, kind: type[Settings] = Known) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from twin.assets.database import Assets
+from twin.assets.provenance import of_verdict
 from twin.assets.record import Record, holding
 from twin.errors import ConfigError
 
@@ -28,6 +29,7 @@ def take_in(
     """Add a record like ``target`` with one more effect and the same valid time."""
     catalogue = {**target.data.get(CATALOGUE, {}), name: dict(effect)}
     provenance = {"effect": name, "file": file, "over": target.id[:8]}
+    provenance |= of_verdict(target.provenance)
     data = {**target.data, CATALOGUE: catalogue}
     return database.add(replace(target, data=data, provenance=provenance))
 

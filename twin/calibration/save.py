@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from twin.assets import provenance
 from twin.assets.catalogue import carried_on
@@ -9,6 +10,8 @@ from twin.assets.database import Assets
 from twin.assets.database_url import open_chosen
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
+from twin.calibration.commission import Commissioned
+from twin.calibration.verdict import Verdict
 from twin.config import Config
 from twin.signals import MBAR
 
@@ -22,11 +25,14 @@ def store(calibration: Calibration, config: Config, assets: str, log: Path) -> t
 
 
 def store_first(
-    calibration: Calibration, config: Config, assets: str, log: Path
+    commissioned: Commissioned, config: Config, assets: str, log: Path
 ) -> tuple[Record, str]:
-    """Store the data set of a unit; add its type with the unit's values if that is unknown."""
+    """Store the data set of a unit; add its type with the unit's values if that is unknown.
+
+    The unit's provenance has the verdict, and times the floor for each weak phase.
+    """
     with open_chosen(assets, config.document, write=True) as database:
-        unit = record_of(calibration, config, log)
+        unit = record_of(commissioned.calibration, config, log)
         if not database.records("type", unit.type):
             type_data = {table: unit.data[table] for table in OF_TYPE}
             note = {"note": f"begun with the commissioning of {unit.name}"}
@@ -35,7 +41,14 @@ def store_first(
                 "type", unit.type, unit.type, type_data, provenance=type_provenance
             )
             database.add(type_record)
-        return add(database, unit), database.name
+        judged = {**unit.provenance, **_judged(commissioned.verdict)}
+        return add(database, replace(unit, provenance=judged)), database.name
+
+
+def _judged(verdict: Verdict) -> dict[str, Any]:
+    """A verdict for the provenance, with the phases that weaken it, the worst first."""
+    weak = {phase.name.lower(): round(verdict.residuals[phase].times, 2) for phase in verdict.weak}
+    return {provenance.VERDICT: verdict.word, **({provenance.WEAK: weak} if weak else {})}
 
 
 def add(database: Assets, unit: Record) -> Record:

@@ -266,10 +266,15 @@ def _line_of_history(record: "Record", recorded: "Callable[[Record], str]") -> s
 
 def _in_full(record: "Record", recorded: "Callable[[Record], str]") -> str:
     from twin.assets.file import write_asset
+    from twin.assets.provenance import VERDICT, WEAK, weak_phases
+    from twin.diagnosis.text import weakness
 
+    shown = {key: text for key, text in record.provenance.items() if key not in (VERDICT, WEAK)}
+    judged = weakness(weak_phases(record.provenance.get(WEAK)))
     lines = [
         f"hash {record.hash}, recorded {recorded(record)}, id {record.id}",
-        *(f"{key}: {value}" for key, value in record.provenance.items()),
+        *(f"{key}: {value}" for key, value in shown.items()),
+        *([judged] if judged else []),
         *(f"array {name}: shape {array.shape}" for name, array in record.arrays.items()),
     ]
     comments = "".join(f"# {line}\n" for text in lines for line in text.splitlines())

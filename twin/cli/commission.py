@@ -131,7 +131,7 @@ def commission(
     record = None
     if commissioned.verdict.word != "refused":
         say_if_new(assets, settings.document)
-        record, location = store_first(commissioned.calibration, settings, assets, source)
+        record, location = store_first(commissioned, settings, assets, source)
         print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
     answers.write(commissioned, settings.asset, record)
     if record is None:

@@ -113,6 +113,8 @@ def diagnose(
     }
     if against := _signals(whole_log):
         head["signals"] = against
+    if config.weak:
+        head["twin"] = {"verdict": "usable", "weak": dict(config.weak)}
     part = _part(blocks, before_s)
     unrecorded = f"{derived}: record the commands as well" if derived else None
     evidence = thinned(whole_log, whole_log.judged, MOST_JUDGED)

@@ -109,6 +109,7 @@ def store(
             "from": config.origin,
             "causes": [cause.effect for cause in diagnosis.acting if _is_lasting(cause)],
             "terms": len(diagnosis.terms),
+            **({provenance.WEAK: dict(config.weak)} if config.weak else {}),
         },
         valid_from_ns=provenance.valid_from(_since(diagnosis)),
     )

@@ -47,6 +47,7 @@ from twin.diagnosis.text import (
     to_do,
     to_find_out,
     to_record,
+    weakness_of,
     when,
 )
 from twin.errors import ConfigError, known_names
@@ -88,6 +89,8 @@ def summary(diagnosis: Diagnosis) -> str:
     times, is_sure = Times.of(answer, now_ns), answer["verdict"] == "explained"
     parts = [page.pairs(about(cause, times, sure=is_sure)) for cause in answer["causes"]]
     parts.append(page.pairs(to_do(answer)))
+    if weakness := weakness_of(answer):
+        parts.append(page.paragraph(f"{capital(weakness)}."))
     if answer["verdict"] == "insufficient":
         return page.summary(f"{mark} {headline(answer, now_ns)}", parts, colour=colour)
     parts.append(_gain_table(answer))
@@ -148,6 +151,8 @@ def _steps(answer: Answer, times: Times) -> Iterator[str]:
         yield page.box(capital(title), f"{capital(text)}.")
     if answer["verdict"] == "consistent":
         yield page.paragraph(tr("Nothing: no cause is worth naming."))
+    if weakness := weakness_of(answer):
+        yield page.paragraph(f"{capital(weakness)}.")
 
 
 def _unlisted_card(answer: Answer) -> str:

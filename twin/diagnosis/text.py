@@ -77,6 +77,22 @@ def signals(answer: Answer) -> Sequence[Answer]:
     return contradictions
 
 
+def weakness_of(answer: Answer) -> str:
+    """In which phases the twin of an answer is weak; empty if it is good."""
+    return weakness(answer.get("twin", {}).get("weak", {}))
+
+
+def weakness(weak: Mapping[str, float]) -> str:
+    """How far a twin is off, by times the floor of its ``weak`` phases; empty without any."""
+    if not weak:
+        return ""
+    phases = [
+        tr("{times} times its floor in {phase}", times=numeral(times, ".1f"), phase=spoken(phase))
+        for phase, times in weak.items()
+    ]
+    return tr("this twin is usable: off {phases}", phases=listed(phases))
+
+
 def headline(answer: Answer, now_ns: int) -> str:
     """One sentence for the technician."""
     causes, times = answer["causes"], Times.of(answer, now_ns)
@@ -154,6 +170,8 @@ def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
     for cause in answer["causes"]:
         yield from about(cause, Times.of(answer, now_ns), sure=answer["verdict"] == "explained")
     yield from to_do(answer)
+    if weakness := weakness_of(answer):
+        yield "the twin", weakness
     if answer["verdict"] == "insufficient":
         return
     yield (
