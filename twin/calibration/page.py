@@ -7,7 +7,14 @@ from pathlib import Path
 from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
 from twin.calibration.picture import draw_fit
-from twin.calibration.report import calibration_headline, headline, parameters, sentences
+from twin.calibration.read_off import read_off
+from twin.calibration.report import (
+    calibration_headline,
+    headline,
+    parameters,
+    sentences,
+    to_check,
+)
 from twin.calibration.verdict import Verdict
 from twin.config import Asset
 from twin.diagnosis import page
@@ -53,7 +60,11 @@ def _page(commissioned: Commissioned, asset: Asset) -> str:
         page.section(tr("What to change"), "\n".join(_remarks(commissioned))),
         _picture(commissioned),
         page.section(tr("How close"), _residuals(commissioned)),
-        page.section(tr("What was found"), _parameters(commissioned.calibration)),
+        page.section(tr("Read off the record"), _read_off(commissioned)),
+        page.section(
+            tr("What was found"),
+            page.details(tr("All values of the data set"), _parameters(commissioned.calibration)),
+        ),
     ]
     return page.PAGE.substitute(
         language=language_code(),
@@ -78,7 +89,9 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
     for contradiction in commissioned.contradictions:
         action = capital(retold(contradiction.action))
         yield page.box(capital(retold(contradiction.what)), f"{action}.")
-    if not commissioned.remarks and not commissioned.contradictions:
+    if commissioned.verdict.word == "refused":
+        yield page.paragraph(f"{to_check()}.")
+    elif not commissioned.remarks and not commissioned.contradictions:
         yield page.paragraph(
             tr("Nothing to change: the record does not contradict the configuration.")
         )
@@ -100,6 +113,14 @@ def _residuals(commissioned: Commissioned) -> str:
     )
     caption = tr("The floor is what cycles of this record differ by, noise included")
     return page.table(caption, head, rows, numbers=(1, 2, 3))
+
+
+def _read_off(commissioned: Commissioned) -> str:
+    head = ("", tr("value"), tr("unit"), tr("known from"))
+    rows = (
+        (entry.name, entry.shown, entry.unit, entry.known_from) for entry in read_off(commissioned)
+    )
+    return page.table("", head, rows, numbers=(1,))
 
 
 def _parameters(calibration: Calibration) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 from twin.assets.record import Record
 from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
+from twin.calibration.read_off import read_off
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
 from twin.diagnosis.text import spoken
@@ -95,6 +96,11 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
             f"a signal contradicts the pressure ({contradiction.signal}): {contradiction.what}",
         ]
         lines += [f"  {contradiction.action}"]
+    lines += ["", "read off the record:"]
+    lines += [
+        f"  {entry.name:<50}{entry.shown:>8} {entry.unit:<5}{entry.known_from}"
+        for entry in read_off(commissioned)
+    ]
     lines += ["", in_words(commissioned.calibration)]
     if commissioned.unseen:
         lines += ["", commissioned.unseen]
@@ -126,6 +132,14 @@ def sentences(verdict: Verdict) -> list[str]:
         ),
         tr("What needs no twin: twin figures, twin compare"),
     ]
+
+
+def to_check() -> str:
+    """What a person can check after a refused fit; without a full stop."""
+    return tr(
+        "Check in [data.system.parts] hoses (length, inner diameter), volumes, and whether parts"
+        " are released (cups) or stay (vessel); check on the machine whether the unit is healthy"
+    )
 
 
 def _weak(phase: Phase, off: Residual) -> str:
@@ -160,6 +174,7 @@ def commissioned_as_json(
         "asset": {"type": asset.type, "id": asset.id},
         "record": record.id if record else None,
         "verdict": commissioned.verdict.word,
+        **_refused_because(commissioned.verdict),
         "residual": {
             phase.name.lower(): {
                 "left_mbar": residual.left / MBAR,
@@ -177,12 +192,23 @@ def commissioned_as_json(
             {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
             for contradiction in commissioned.contradictions
         ],
+        "read_off": {
+            entry.key: {"value": entry.value, "unit": entry.unit, "from": entry.source}
+            for entry in read_off(commissioned)
+        },
         "assumed": commissioned.assumed,
         "unseen": commissioned.unseen,
         "cycles": commissioned.calibration.cycles,
         "parameters": parameters(commissioned.calibration),
         "data": fitted.data.model_dump(),
     }
+
+
+def _refused_because(verdict: Verdict) -> dict[str, str]:
+    """Reason of a refused fit, and what to do; nothing of another verdict."""
+    if verdict.word != "refused":
+        return {}
+    return {"reason": sentences(verdict)[0], "do": to_check()}
 
 
 def refusal_as_json(error: TwinError, asset: Asset) -> dict[str, Any]:

@@ -43,6 +43,7 @@ aside { background: var(--box); border-left-color: var(--blue);
 article p, aside p { margin: 0; }
 article dl { margin: .5rem 0 0; grid-template-columns: 7.5rem 1fr; }
 figure { margin: 0; }
+summary { cursor: pointer; padding: .3rem 0; }
 svg { width: 100%; height: auto; }
 .on-phone { display: none; }
 @media screen and (max-width: 44rem) {
@@ -178,6 +179,11 @@ def english_card(title: str, sentence: str) -> str:
 def box(title: str, text: str) -> str:
     """A box with an action."""
     return f"<aside><h3>{html.escape(title)}</h3><p>{html.escape(text)}</p></aside>"
+
+
+def details(title: str, body: str) -> str:
+    """A part that opens when its title is chosen: for what few people look up."""
+    return f"<details><summary>{html.escape(title)}</summary>\n{body}\n</details>"
 
 
 def paragraph(text: str) -> str:
