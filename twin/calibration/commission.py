@@ -23,6 +23,7 @@ from twin.calibration.calibrate import (
     scatter,
 )
 from twin.calibration.cycles import Cycles
+from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
 from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read
@@ -116,6 +117,7 @@ class Commissioned:
     remarks: tuple[Remark, ...]
     contradictions: tuple[Contradiction, ...]  # between reported signals and the pressure
     samples: Samples  # on which the twin was judged
+    doubts: tuple[Doubt, ...] = ()  # that the record is of a healthy unit
 
     @property
     def assumed(self) -> list[str]:
@@ -205,8 +207,17 @@ def commission(
     healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
     times = samples["host_ns"]
     calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
+    doubts = list(measured_doubts(within(config.data, fitted.data.ambient), readings, healthy))
+    if verdict.word != "refused":
+        doubts += doubts_of_type(config, fitted)
     return Commissioned(
-        calibration, readings, verdict, tuple(remarks), tuple(contradictory), samples
+        calibration,
+        readings,
+        verdict,
+        tuple(remarks),
+        tuple(contradictory),
+        samples,
+        tuple(doubts),
     )
 
 

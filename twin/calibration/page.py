@@ -83,6 +83,9 @@ def _page(commissioned: Commissioned, asset: Asset) -> str:
 
 
 def _remarks(commissioned: Commissioned) -> Iterator[str]:
+    for doubt in commissioned.doubts:
+        what = tr("Is the unit healthy? {what}", what=capital(retold(doubt.text)))
+        yield page.box(what, f"{capital(retold(doubt.action))}.")
     for remark in commissioned.remarks:
         advice = tr("The record's value is used. Write: {line}", line=retold(remark.line))
         yield page.box(capital(retold(remark.text)), advice)
@@ -91,7 +94,7 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
         yield page.box(capital(retold(contradiction.what)), f"{action}.")
     if commissioned.verdict.word == "refused":
         yield page.paragraph(f"{to_check()}.")
-    elif not commissioned.remarks and not commissioned.contradictions:
+    elif not (commissioned.doubts or commissioned.remarks or commissioned.contradictions):
         yield page.paragraph(
             tr("Nothing to change: the record does not contradict the configuration.")
         )

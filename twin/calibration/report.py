@@ -87,6 +87,8 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
         f" this record cannot be followed nearer than {residual.floor / MBAR:.2f}"
         for phase, residual in commissioned.verdict.residuals.items()
     ]
+    for doubt in commissioned.doubts:
+        lines += ["", f"is the unit healthy? {doubt.text}", f"  {doubt.action}"]
     for remark in commissioned.remarks:
         lines += ["", f"the record contradicts the configuration: {remark.text}"]
         lines += [f"  the record's value is used; write: {remark.line}"]
@@ -188,6 +190,7 @@ def commissioned_as_json(
         "contradicts": [
             {"what": remark.text, "line": remark.line} for remark in commissioned.remarks
         ],
+        "doubts": [{"what": doubt.text, "do": doubt.action} for doubt in commissioned.doubts],
         "signals": [
             {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
             for contradiction in commissioned.contradictions

@@ -108,6 +108,21 @@ _COMMISSIONING = (  # what a record corrects in the configuration, and the lines
     '[[data.system.parts]] kind = "sensor", after the tubes',
     '[[data.system.parts]] kind = "sensor", before the tubes',
 )
+_DOUBTS = (  # that a record is of a healthy unit, and what to do
+    "what counts as healthy from now on leaks {leakage} mbar/s in hold; {limit} mbar/s is the usual"
+    " limit",
+    "repair first and record again, or leave it if it is as built",
+    "what counts as healthy from now on never reaches H1, {h1} mbar: the vacuum is {highest} mbar"
+    " at most",
+    "look for leaks and a low supply, or let suction last longer, and record again",
+    "{name} is {value} {unit}, where {low} to {high} is healthy for its type",
+    "suction capacity",
+    "end pressure",
+    "response of the nozzle",
+    "blow-off flow",
+    "response of blow-off",
+    "leak",
+)
 _REFUSALS = (  # why a record cannot be commissioned, and what to do
     "{log}: {derived}. A twin needs to know when valves were told",
     "{commands} derived from the pressure: {suctions}; {releases}; valve delays and the timing of"
@@ -186,6 +201,7 @@ def templates() -> list[str]:
         *_SIGNALS,
         *_ALARMS,
         *_COMMISSIONING,
+        *_DOUBTS,
         *_REFUSALS,
         *_FLEETS,
         *caution_words,
