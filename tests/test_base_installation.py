@@ -193,7 +193,7 @@ HINTS = {
     "opcua": (
         "run U --once",
         "probe U",
-        "commission U --cycles 2 --id new",
+        "commission U --cycles 5 --id new",
         "plc U --port 0 --duration 0.1",
         "cert pki",
     ),

@@ -1,6 +1,6 @@
 """``twin commission``: the data set of a unit of unknown type, from a record or from its PLC."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from twin.cli.app import say_if_cut, say_if_new
 from twin.cli.console import status
 from twin.cli.options import (
     JSON,
+    LOG,
     PAGE,
     AssetsUrl,
     ConfigOption,
@@ -20,9 +21,10 @@ from twin.cli.options import (
     PageFile,
     UnitId,
     chosen,
+    strictly,
 )
 from twin.cli.options import output as output_option
-from twin.cli.stopping import closed
+from twin.cli.recording import FEWEST_CYCLES
 from twin.errors import ConfigError
 from twin.files import require_writable, write_json
 from twin.languages.choice import language_of
@@ -31,9 +33,7 @@ from twin.languages.texts import ENGLISH, Language
 if TYPE_CHECKING:
     from twin.assets.record import Record
     from twin.calibration.commission import Commissioned
-    from twin.config import Asset
-    from twin.settings import Document
-    from twin.signals import Samples
+    from twin.config import Asset, Config
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,19 @@ def commission(
     unit: UnitId = "",
     config: ConfigOption = None,
     cycles: Annotated[
-        int, typer.Option(metavar="N", help="How many cycles to record from a PLC.")
+        int,
+        typer.Option(
+            metavar="N", min=FEWEST_CYCLES, help="How many cycles to record from a PLC, 5 or more."
+        ),
     ] = 12,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            callback=strictly(LOG),
+            help="Where they are logged, instead of ID_TIME.mcap beside CONFIG.",
+        ),
+    ] = None,
     assets: AssetsUrl = "",
     output: Annotated[Path | None, output_option(PAGE, JSON)] = None,
     json_file: JsonFile = None,
@@ -91,7 +102,8 @@ def commission(
     """Fit a unit that nobody has seen before to a record of healthy cycles, and store it.
 
     The configuration says what hangs on the ejector; a fifth off is near enough. The record
-    corrects it where they differ. The verdict is good, usable or refused (exit code 2).
+    corrects it where they differ. The verdict is good, usable or refused (exit code 2). With CONFIG
+    alone, cycles are recorded from the PLC into a log first, which is kept.
     """
     from twin.calibration.commission import commission as fit_unit
     from twin.calibration.report import commissioned_in_words
@@ -106,27 +118,18 @@ def commission(
         language_of(language, "--language"),
     )
     require_writable(answers.json, answers.page)
-    recorded = None if source.suffix == ".toml" else open_log(source)
-    if recorded is not None:
-        say_if_cut(recorded, source, "used")
-    if recorded is None or config is not None:
-        document = Document.read(config or source)
-    else:
-        document = document_in(recorded.header)
-    settings = Config.of(document, assets, unit, calibrated=False)
-    if recorded is not None:
-        settings = settings.of_rows(recorded.header)
-    if not settings.asset.id:
-        raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
+    if source.suffix == ".toml":
+        source, config = _recorded(source, config, assets, unit, cycles, log), config or source
+    elif log is not None:
+        raise ConfigError(f"{source} is a log already", "leave --log out")
+    recorded = open_log(source)
+    say_if_cut(recorded, source, "used")
+    document = document_in(recorded.header) if config is None else Document.read(config)
+    settings = _named(Config.of(document, assets, unit, calibrated=False))
+    settings = settings.of_rows(recorded.header)
     with status() as say, answers.refusals(settings.asset):
-        if recorded is not None:
-            recorded.header.require_commands(str(source))
-        blocks = (
-            (rows for rows, _ in recorded.blocks())
-            if recorded is not None
-            else _recorded_cycles(document, cycles, say)
-        )
-        commissioned = fit_unit(settings, blocks, say)
+        recorded.header.require_commands(str(source))
+        commissioned = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
     print(commissioned_in_words(commissioned))
     record = None
     if commissioned.verdict.word != "refused":
@@ -138,21 +141,26 @@ def commission(
         raise typer.Exit(2)
 
 
-def _recorded_cycles(
-    document: "Document", cycles: int, say: "Callable[[str], None]"
-) -> "Iterator[Samples]":
-    """Blocks from the PLC until so many cycles have ended after the first, which may be partial."""
-    from drivers.sources import open_source
-    from twin.signals import Command
+def _named(settings: "Config") -> "Config":
+    """The configuration; ConfigError if it names no unit."""
+    if not settings.asset.id:
+        raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
+    return settings
 
-    begun, before = 0, True
-    source = open_source(document)
-    with closed(source):
-        for block in source:
-            on = (block["commands"] & Command.SUCTION) != 0
-            for row in on.tolist():
-                begun, before = begun + (row and not before), row
-            say(f"recording: suction {min(begun, cycles + 2)} of {cycles + 2}")
-            yield block
-            if begun > cycles + 1:
-                return
+
+def _recorded(
+    source: Path, config: Path | None, assets: str, unit: str, cycles: int, log: Path | None
+) -> Path:
+    """Record the cycles of a PLC; gives their log. What is wrong otherwise is said before."""
+    from twin.cli.recording import log_beside, record_cycles
+    from twin.config import Config
+    from twin.files import refuse_existing
+    from twin.settings import Document
+
+    document = Document.read(config or source)
+    settings = _named(Config.of(document, assets, unit, calibrated=False))
+    log = log or log_beside(source, settings.asset.id)
+    require_writable(log)
+    refuse_existing(log)
+    record_cycles(settings, cycles, log)
+    return log

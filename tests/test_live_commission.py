@@ -1,0 +1,156 @@
+"""A commissioning from the PLC: its cycles are logged first, and the log is what counts."""
+
+import os
+import signal
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rigs
+from calibrations import log_of
+from command_line import edited, twin
+from plc_process import PlcProcess
+from written_pages import commissioned
+
+import drivers.sources
+from twin.assets.database_url import open_chosen
+from twin.calibration.calibrate import FEWEST
+from twin.calibration.commission import Commissioned
+from twin.cli import recording
+from twin.cli.recording import FEWEST_CYCLES, NO_SUCTION, enough, log_beside
+from twin.config import Config
+from twin.log.reader import open_log
+from twin.signals import NS, Command, Samples
+
+UNIT = "gripper/new"
+
+
+def rows_in(log: Path) -> Samples:
+    return np.concatenate([rows for rows, _ in open_log(log).blocks()])
+
+
+def suctions(samples: Samples) -> int:
+    return int(np.count_nonzero(np.diff((samples["commands"] & Command.SUCTION).astype(int)) == 1))
+
+
+def ends_as(word: str, monkeypatch: pytest.MonkeyPatch) -> list[Samples]:
+    """Let the fit end with a verdict; gives the rows that it was made of."""
+    fitted = list[Samples]()
+
+    def fit(_config: Config, blocks: Iterable[Samples], _say: object) -> Commissioned:
+        fitted.append(np.concatenate(list(blocks)))
+        return replace(commissioned(word), samples=fitted[0])
+
+    monkeypatch.setattr("twin.calibration.commission.commission", fit)
+    return fitted
+
+
+def plays(monkeypatch: pytest.MonkeyPatch, samples: Samples, *, interrupted: bool = False) -> None:
+    """Let the PLC give these rows, and a person stop it in the midst of them."""
+
+    def blocks(*_arguments: object) -> Iterator[Samples]:
+        for number, block in enumerate(rigs.cut(samples, 500)):
+            if interrupted and number == 10:
+                os.kill(os.getpid(), signal.SIGINT)
+            yield block
+
+    monkeypatch.setattr(drivers.sources, "open_source", blocks)
+
+
+def cell(folder: Path) -> tuple[Path, str]:
+    path, _ = edited(folder, "port = 5021", "port = 5021", "gripper")
+    return path, f"sqlite:///{folder}/assets.sqlite"
+
+
+@pytest.mark.slow
+def test_a_plc_is_recorded_and_the_log_is_commissioned(
+    plc: PlcProcess,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, _ = edited(tmp_path, "port = 5021", f"port = {plc.port}", "gripper")
+    url, fitted = f"sqlite:///{tmp_path}/assets.sqlite", ends_as("usable", monkeypatch)
+    command = ("commission", path, "--cycles", "5", "--id", UNIT, "--assets", url)
+    assert twin(monkeypatch, *command) == 0
+    (log,) = tmp_path.glob("gripper_new_*Z.mcap")
+    assert f"recording in {log}" in capsys.readouterr().err
+    assert open_log(log).header.asset_id == UNIT
+    assert np.array_equal(rows_in(log)["pressure"], fitted[0]["pressure"])
+    assert suctions(rows_in(log)) == 7  # the first may be partial, and in one the twin settles
+    config = Config.of(rigs.config("gripper").document)
+    with open_chosen(url, config.document, write=False) as database:
+        (record,) = database.records("instance", UNIT)
+    assert record.provenance["log"] == log.name
+
+
+@pytest.mark.parametrize(("word", "code"), [("good", 0), ("refused", 2)])
+def test_the_log_stays_however_the_fit_ends(
+    word: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path, url), log = cell(tmp_path), tmp_path / "mine.mcap"
+    ends_as(word, monkeypatch)
+    plays(monkeypatch, log_of("gripper"))
+    command = ("commission", path, "--cycles", "5", "--assets", url, "--log", log)
+    assert twin(monkeypatch, *command) == code
+    assert suctions(rows_in(log)) == 7
+    assert twin(monkeypatch, *command) == 3  # it is not written over
+    assert suctions(rows_in(log)) == 7
+
+
+def test_an_interrupted_recording_leaves_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path, url), log = cell(tmp_path), tmp_path / "mine.mcap"
+    fitted = ends_as("good", monkeypatch)
+    plays(monkeypatch, log_of("gripper"), interrupted=True)
+    assert twin(monkeypatch, "commission", path, "--assets", url, "--log", log) == 130
+    assert fitted == []
+    assert len(rows_in(log)) >= 10 * 500
+
+
+def test_too_few_cycles_are_a_mistake_before_the_plc_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, url = cell(tmp_path)
+    monkeypatch.setattr(drivers.sources, "open_source", pytest.fail)
+    assert twin(monkeypatch, "commission", path, "--cycles", "4", "--assets", url) == 2
+    assert "Input should be greater than or equal to 5" in capsys.readouterr().err
+    assert FEWEST_CYCLES == FEWEST
+
+
+def test_a_log_is_not_logged_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "a.mcap"
+    assert twin(monkeypatch, "commission", log, "--log", tmp_path / "b.mcap") == 2
+    assert "is a log already" in capsys.readouterr().err
+
+
+def test_without_suction_the_tag_to_check_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = list[str]()
+    monkeypatch.setattr(recording, "complain", told.append)
+    rows = log_of("gripper").copy()
+    rows["commands"] &= np.uint8(Command.BLOW_OFF)
+    long = int(150.0 / NS / 1e6)  # rows of 1 ms
+    silent = np.resize(rows, long)
+    seconds = [0.0]
+
+    def played() -> Iterator[Samples]:
+        for block in rigs.cut(silent, 500):
+            seconds[0] += 0.5
+            yield block
+        yield log_of("gripper")
+
+    for _ in enough(played(), 12, lambda _what: None, lambda: seconds[0]):
+        assert told == ([NO_SUCTION] if seconds[0] > 60.0 else [])
+    assert told == [NO_SUCTION]
+
+
+def test_a_log_is_named_by_unit_and_time(tmp_path: Path) -> None:
+    log = log_beside(tmp_path / "cell.toml", UNIT)
+    assert log.parent == tmp_path
+    assert log.name.startswith("gripper_new_20")
+    assert log.name.endswith("Z.mcap")
