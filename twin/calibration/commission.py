@@ -26,20 +26,21 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
 from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
-from twin.calibration.readings import Readings, read
+from twin.calibration.readings import Readings, read, rows_by_phase
 from twin.calibration.stationarity import refuse_parted
 from twin.calibration.thresholds import decided
 from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
 from twin.config import Config
+from twin.diagnosis.text import listed, spoken
 from twin.errors import ConfigError
-from twin.languages.texts import numeral, tr
+from twin.languages.texts import ntr, numeral, tr
 from twin.model import theta as c
 from twin.model.dataset import Ambient, DataSet, coefficients, sensor_place
 from twin.model.effects import standing_for
 from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
-from twin.monitor.cycles import Cycle
+from twin.monitor.cycles import FEWEST_ROWS, Cycle
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in
@@ -128,13 +129,33 @@ class Commissioned:
 
     @property
     def unseen(self) -> str:
-        """One sentence on what the record's cadence cannot show; empty if it shows all."""
+        """What the record's cadence cannot show, without a full stop; empty if it shows all."""
+        return "; ".join(filter(None, (self._coarse, self._short)))
+
+    @property
+    def _coarse(self) -> str:
+        """What rows far apart cannot show."""
         if self.readings.period <= COARSE:
             return ""
         return tr(
             "with a row each {apart} ms, when valves and nozzle act and how the pressure begins to"
             " move is known to about {apart} ms; smaller delays are not told apart",
             apart=numeral(self.readings.period / MS, ".0f"),
+        )
+
+    @property
+    def _short(self) -> str:
+        """Which phases have too few rows for the monitor."""
+        rows = rows_by_phase(self.samples["commands"])
+        short = [phase for phase in sorted(rows) if rows[phase] < FEWEST_ROWS]
+        if not short:
+            return ""
+        return ntr(
+            "{phases} has fewer than {rows} rows in a cycle: no alarm judges so short a phase",
+            "{phases} have fewer than {rows} rows in a cycle: no alarm judges so short a phase",
+            len(short),
+            phases=listed([spoken(phase.name.lower()) for phase in short]),
+            rows=FEWEST_ROWS,
         )
 
 

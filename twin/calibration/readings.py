@@ -19,7 +19,7 @@ from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at
 from twin.monitor.surroundings import told
 from twin.quality import UNUSABLE
-from twin.signals import MBAR, MS, NS, Command, Reported, Samples
+from twin.signals import MBAR, MS, NS, Command, Phase, Reported, Samples
 
 Floats = npt.NDArray[np.float64]
 
@@ -48,6 +48,7 @@ OPENED_FROM, OPENED_TO = 0.6, 0.85  # part of an idle in which an opened system 
 # A blow-off is steady in its last milliseconds, or is not; its valve closes within the others.
 STEADY_MS, ENDS_MS = 20.0, 150.0
 SUDDEN = 2.0  # times as steep as before: suction has ended, against which blow-off worked
+COMMANDED = {0: Phase.IDLE, Command.SUCTION: Phase.SUCTION, Command.BLOW_OFF: Phase.BLOW_OFF}
 STILL = 3.0  # sigmas by which the pressure of an opened system may move in that time
 
 
@@ -206,6 +207,17 @@ def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:
     edges = np.concatenate([[0], np.flatnonzero(np.diff(command)) + 1, [len(command)]])
     for first, last in pairwise(edges.tolist()):
         yield Stretch(int(command[first]), first, last)
+
+
+def rows_by_phase(commands: npt.NDArray[np.uint8]) -> dict[Phase, float]:
+    """Median rows of each commanded phase; the first and last stretch may be cut short.
+
+    Suction lasts as long as its command, with what the ejector holds by itself.
+    """
+    rows: dict[Phase, list[float]] = {}
+    for stretch in list(stretches(commands))[1:-1]:
+        rows.setdefault(COMMANDED[stretch.command], []).append(stretch.last - stretch.first)
+    return {phase: _median(lengths) for phase, lengths in rows.items()}
 
 
 def noise_of(pressure: Floats, period: float) -> float:
