@@ -1,5 +1,6 @@
 """A commissioning from the PLC: its cycles are logged first, and the log is what counts."""
 
+import json
 import os
 import signal
 from collections.abc import Iterable, Iterator
@@ -97,6 +98,23 @@ def test_the_log_stays_however_the_fit_ends(
     assert twin(monkeypatch, *command) == code
     assert suctions(rows_in(log)) == 7
     assert twin(monkeypatch, *command) == 3  # it is not written over
+    assert suctions(rows_in(log)) == 7
+
+
+def test_a_record_from_the_plc_that_is_refused_leaves_log_answer_and_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path, url), log = cell(tmp_path), tmp_path / "mine.mcap"
+    swapped = log_of("gripper").copy()
+    swapped["pressure"] = 202_600.0 - swapped["pressure"]  # its sign is wrong
+    plays(monkeypatch, swapped)
+    answer, page = tmp_path / "a.json", tmp_path / "a.html"
+    command = ("commission", path, "--assets", url, "--log", log, "--json", answer, "-o", page)
+    assert twin(monkeypatch, *command, "--cycles", "5") == 2
+    stored = json.loads(answer.read_text(encoding="utf-8"))
+    assert "its sign is wrong" in stored["reason"]
+    assert 'set reference = "gauge"' in stored["do"]
+    assert "its sign is wrong. Set reference" in page.read_text(encoding="utf-8")
     assert suctions(rows_in(log)) == 7
 
 

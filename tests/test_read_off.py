@@ -106,6 +106,8 @@ def test_a_refused_page_says_what_to_check(tmp_path: Path) -> None:
     assert "Nothing to change" in pages["good"]
     assert "Nothing to change" not in pages["refused"]
     assert "hoses (length, inner diameter), volumes, and whether parts are" in pages["refused"]
+    assert "hoses (length, inner diameter)" in commissioned_in_words(without_remarks("refused"))
+    assert "hoses (length, inner diameter)" not in commissioned_in_words(commissioned("usable"))
 
 
 def test_a_refused_fit_has_reason_and_advice_for_programs() -> None:

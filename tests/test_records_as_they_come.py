@@ -43,8 +43,8 @@ def edges_of_suction(samples: Samples) -> list[int]:
     return [int(row) for row in np.flatnonzero(on[1:] & ~on[:-1]) + 1]
 
 
-@pytest.mark.parametrize("begin", [300, 900, 1250])
-@pytest.mark.parametrize("end", [300, 900, 1250])
+@pytest.mark.parametrize("begin", [300, 900, 1195, 1250])
+@pytest.mark.parametrize("end", [1, 25, 300, 900, 1250])
 def test_a_record_may_begin_and_end_in_mid_cycle(
     begin: int, end: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

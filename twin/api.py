@@ -283,6 +283,11 @@ class Commissioned(Calibrated):
         """What the record contradicts in the configuration, and the line to write instead."""
         return [f"{remark.text}: {remark.line}" for remark in self._commissioning.remarks]
 
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons to doubt that the unit is healthy, each with what to do."""
+        return [f"{doubt.text}: {doubt.action}" for doubt in self._commissioning.doubts]
+
     def report(self, path: Place, language: str = "en") -> None:
         """Write it with pictures as one HTML file, in a language such as ``de``.
 

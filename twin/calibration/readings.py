@@ -139,6 +139,8 @@ def read(samples: Samples) -> Readings:
     reported = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
     nozzle = (rows["reported"] & np.uint8(Reported.NOZZLE)) != 0
     for stretch in suctions:
+        if stretch.last - stretch.first <= edge:  # the record begins or ends in it
+            continue
         smooth = _smoothed(pressure[stretch.first : stretch.last], width)[edge:]
         rows_of_turns = turns(smooth, turn)
         lows, highs = deep(smooth, rows_of_turns[0::2], rows_of_turns[1::2])

@@ -87,6 +87,8 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
         f" this record cannot be followed nearer than {residual.floor / MBAR:.2f}"
         for phase, residual in commissioned.verdict.residuals.items()
     ]
+    if commissioned.verdict.word == "refused":
+        lines += ["", to_check()]
     for doubt in commissioned.doubts:
         lines += ["", f"is the unit healthy? {doubt.text}", f"  {doubt.action}"]
     for remark in commissioned.remarks:
