@@ -77,6 +77,6 @@ class Healthy(Settings):
     def is_known(self) -> bool:
         """Whether the unit is commissioned: its healthy cycles were looked at.
 
-        A phase that is too short to be judged has no figures.
+        Phases too short to be judged by the monitor have no figures, but errors of the model.
         """
-        return any(name.endswith("_rms") for name in self.figures)
+        return bool(self.error) or "suction_rms" in self.figures
