@@ -48,7 +48,7 @@ class ReportTags(Protocol):
 
 
 def refuse_unclear(nozzle: object, air_saving: object, ambient: Quantity | None) -> None:
-    """ValueError if two tags report the same nozzle, or the barometer is not absolute."""
+    """Raise ValueError if two tags report the nozzle, or if the barometer is not absolute."""
     if nozzle is not None and air_saving is not None:
         raise ValueError("nozzle and air_saving say the same of the nozzle: leave one of them out")
     if ambient is not None and ambient.reference != "absolute":

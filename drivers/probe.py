@@ -7,8 +7,8 @@ from drivers.reconnect import Clock, LostError
 from drivers.trace import Header
 from twin.errors import SourceError
 
-TIMES = 20  # requests to measure the round trip with
-WATCHED_S = 0.5  # to measure the scan rate
+TIMES = 20  # requests by which the round trip is measured
+WATCHED_S = 0.5  # s, for measuring the scan rate
 # Fraction of the time watched. A PLC's clock is off by less than a thousandth. A task that misses
 # its period, or a sequence with swapped words, is off by much more.
 RATE_TOLERANCE = 0.1

@@ -1,4 +1,4 @@
-"""Connections that are retried for ever, for any protocol, whether it reads or writes."""
+"""Connections of any protocol, for reading or writing, that are retried for ever."""
 
 import errno
 import queue
@@ -16,9 +16,9 @@ from twin.backoff import Backoff
 from twin.errors import SourceError, TwinError
 from twin.signals import SAMPLE, Samples
 
-RETRY_S = 0.4  # between two attempts to connect
-LONGEST_RETRY_S = 1.6  # to a PLC that connects and gives no rows; a ring of 4 s outlasts it
-WAITING = 256  # blocks that may wait to be taken from a thread
+RETRY_S = 0.4  # s between two attempts to connect
+LONGEST_RETRY_S = 1.6  # s, for a PLC that connects without rows; a ring of 4 s outlasts it
+WAITING = 256  # longest queue of blocks from a thread
 LONGEST_SILENCE_S = 0.25
 
 EMPTY: Samples = np.empty(0, SAMPLE)
@@ -73,10 +73,10 @@ class Connection(Protocol):
         """Connect, unless it is connected; LostError if that fails."""
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
 
 
-Away = Callable[[TwinError], None]  # receives why a PLC gives no rows, each reason once
+Away = Callable[[TwinError], None]  # receives each reason why a PLC gives no rows once
 
 B = TypeVar("B", bound=Sized)
 C = TypeVar("C", bound=Connection)
@@ -101,8 +101,8 @@ def reconnecting(
 ) -> Generator[Samples, None, None]:
     """Samples of ``source`` over successive connections; empty blocks in between.
 
-    As ``retrying``: before there are rows, and with ``away``, a PLC is retried that cannot be
-    reached or lacks an address.
+    Retries are those of ``retrying``. With ``away``, a PLC that cannot be reached or lacks an
+    address is also retried before its first rows.
     """
     may_pass = () if away is None else (LostError, AbsentError)
     return retrying(source.samples, link, EMPTY, clock, away, known=known, may_pass=may_pass)
@@ -147,7 +147,7 @@ def retrying(
                 if away is not None and str(error) not in reasons:
                     reasons.add(str(error))
                     away(error)
-                link.close()  # what it remembers of the PLC may no longer hold
+                link.close()  # its knowledge of the PLC may be out of date
                 # An absent PLC is retried at the shortest interval, so that no row is missed.
                 yield from _pause(clock, backoff.next_s() if connected else RETRY_S, nothing)
     finally:

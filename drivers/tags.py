@@ -1,4 +1,4 @@
-"""Tags: where a value lies in a Modbus PLC, how it is coded, and what it means.
+"""Tags: address, coding and meaning of a value in a Modbus PLC.
 
 Registers arrive as ``uint16`` arrays of shape (rows, registers of one value) and leave as columns
 of ``SAMPLE``: values in Pa and ``Quality`` bits. Everything is vectorised over the rows.
@@ -77,7 +77,7 @@ class Address:
 
     @property
     def manual(self) -> str:
-        """As manuals write it: five digits where they suffice, else six."""
+        """The address in the notation of manuals: five digits if they suffice, else six."""
         width = 4 if self.offset < 9999 else 5
         return f"{REFERENCE_DIGIT[self.area]}{self.offset + 1:0{width}}"
 
@@ -105,8 +105,8 @@ class Tag(Settings):
     """A bit or a number in the PLC."""
 
     address: Place  # "40101" as in manuals, or "holding:100" counted from 0
-    type: Type = "bit"  # how it is coded
-    bit: int | None = Field(default=None, ge=0, le=15)  # of a word, 0 the lowest
+    type: Type = "bit"  # coding of the number
+    bit: int | None = Field(default=None, ge=0, le=15)  # bit of a word, 0 the lowest
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -123,7 +123,7 @@ class Tag(Settings):
 
     @property
     def size(self) -> int:
-        """How many registers (or coils) it takes."""
+        """Number of registers (or coils) of the value."""
         return np.dtype(CODE[self.type]).itemsize // 2
 
     def raw(self, words: Words, order: WordOrder) -> npt.NDArray[np.generic]:
@@ -138,10 +138,10 @@ class Tag(Settings):
 
 
 class Scaled(Settings):
-    """What a number means: value = raw · scale + offset in its unit."""
+    """Scaling of a number: value = raw · scale + offset in its unit."""
 
-    scale: float = 1.0  # of the raw number
-    offset: float = 0.0  # added after scaling, in the unit
+    scale: float = 1.0  # factor on the raw number
+    offset: float = 0.0  # offset in the unit, added after scaling
 
     @model_validator(mode="after")
     def _has_a_scale(self) -> Self:
@@ -150,7 +150,7 @@ class Scaled(Settings):
         return self
 
     def value(self, raw: Floats) -> Floats:
-        """In the unit of the tag."""
+        """Scaled values in the unit of the tag."""
         with np.errstate(invalid="ignore", over="ignore"):  # callers flag what is not finite
             return raw * self.scale + self.offset
 
@@ -158,7 +158,7 @@ class Scaled(Settings):
 class Thermometer(Scaled):
     """A temperature, of the gas or of what surrounds the ejector."""
 
-    unit: Literal["C", "K"]  # of value = raw · scale + offset
+    unit: Literal["C", "K"]  # unit of the scaled value
 
     def kelvin(self, raw: Floats) -> Floats:
         """Temperatures in K."""
@@ -168,7 +168,7 @@ class Thermometer(Scaled):
 class Flowmeter(Scaled):
     """A suction flow, positive into the ejector: standard or normal litres a minute."""
 
-    unit: Literal["sl/min", "Nl/min"]  # of value = raw · scale + offset
+    unit: Literal["sl/min", "Nl/min"]  # unit of the scaled value
 
     def mass_flow(self, raw: Floats) -> Floats:
         """Flows in kg/s."""
@@ -176,12 +176,14 @@ class Flowmeter(Scaled):
 
 
 class Quantity(Scaled):
-    """What a number means: pressure = raw · scale + offset in ``unit``, from ``reference``."""
+    """Scaling of a pressure: raw · scale + offset in ``unit``, counted from ``reference``."""
 
-    unit: Unit  # of value = raw · scale + offset
+    unit: Unit  # unit of the scaled value
     reference: Reference  # vacuum: positive below ambient
-    range: tuple[float, float] | None = None  # in unit; beyond it a value is flagged, and kept
-    overflow_above: int | None = Field(default=None, ge=0)  # raw; Siemens 32511; both signs
+    # Limits in unit; a value beyond them is flagged and kept.
+    range: tuple[float, float] | None = None
+    # Raw number above which, of either sign, the input overflows (Siemens: 32511).
+    overflow_above: int | None = Field(default=None, ge=0)
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Self:
@@ -209,7 +211,7 @@ class Quantity(Scaled):
     def raw_of(self, pressure: float, ambient: float) -> tuple[float, bool]:
         """The PLC's number for ``pressure`` (Pa, absolute), and whether it is within range.
 
-        Beyond the range it is the number of the nearer end.
+        A pressure beyond the range is clipped to its nearer end.
         """
         counted = counted_from(np.array([pressure]), "absolute", self.reference, ambient)
         value = float(counted[0]) / PASCAL[self.unit]
@@ -237,7 +239,7 @@ class Quantity(Scaled):
 class Pressure(Quantity, Tag):
     """A pressure in the PLC's registers."""
 
-    type: Type  # how it is coded
+    type: Type  # coding of the number
 
     @model_validator(mode="after")
     def _is_a_number(self) -> Self:
@@ -261,13 +263,13 @@ class Pressure(Quantity, Tag):
 class Temperature(Thermometer, Tag):
     """A temperature in the PLC's registers."""
 
-    type: NumberType  # how it is coded
+    type: NumberType  # coding of the number
 
 
 class Flow(Flowmeter, Tag):
     """A suction flow in the PLC's registers."""
 
-    type: NumberType  # how it is coded
+    type: NumberType  # coding of the number
 
 
 def words_of(number: float, code: str, order: WordOrder) -> tuple[int, ...]:

@@ -1,7 +1,8 @@
-"""Follow a PLC's ring of scans without losing one, over any protocol.
+"""Follow a PLC's ring of scans without loss, over any protocol.
 
-The PLC writes a record per scan into a ring and counts them in a header. A record proves itself by
-its sequence number. A lost record shows as a missing number, and as a flag on the next sample.
+The PLC writes a record per scan into a ring and counts them in a header. The sequence number of a
+record shows whether it is the expected one. A lost record leaves a missing number, and a flag on
+the next sample.
 """
 
 from abc import ABC, abstractmethod
@@ -22,22 +23,22 @@ COMMANDS = 0b11  # in the status of a record, as in Command
 COMMAND_BITS = {"suction": 0, "blow_off": 1}  # the same by the tags' names
 OVERFLOW_BIT = 8  # in the status of a record
 RESERVE = 64  # records at the old end of the ring that the PLC may overwrite while they are read
-CLOCK_TOLERANCE_NS = 50_000_000  # PLC time against sequence
-LONGEST_PERIOD_NS = 1_000_000_000  # of a PLC's scans
-LATEST_NS = 1 << 62  # the year 2116; beyond it is no time
+CLOCK_TOLERANCE_NS = 50_000_000  # permitted difference of PLC time and sequence
+LONGEST_PERIOD_NS = 1_000_000_000  # longest period of a PLC's scans
+LATEST_NS = 1 << 62  # the year 2116; a later time is invalid
 WRAP = 1 << 32  # the PLC counts with 32 bits
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the PLC says about its ring."""
+    """The PLC's header of its ring."""
 
-    sequence: int  # of the newest complete record, 32 bits
-    time_ns: int  # of that record
+    sequence: int  # sequence number of the newest complete record, 32 bits
+    time_ns: int  # time of that record
     boot: int  # differs after every restart
     period_ns: int
     depth: int  # records
-    unsure_ns: int = field(default=0, kw_only=True)  # how far off its time may be
+    unsure_ns: int = field(default=0, kw_only=True)  # largest error of its time
 
     @property
     def ready(self) -> bool:
@@ -61,7 +62,7 @@ class Header:
         return abs(drift_ns) > CLOCK_TOLERANCE_NS
 
     def follows(self, earlier: "Header") -> bool:
-        """Whether nothing happened but a few more scans."""
+        """Whether the PLC has only continued to scan since ``earlier``."""
         scans = self.advance(earlier)
         return (
             self.ready
@@ -102,11 +103,11 @@ def refusal(header: Header) -> type[SourceError]:
 
 
 class Paced(Protocol):
-    """Settings that say how often to read."""
+    """Settings of the reading interval."""
 
     @property
     def interval_ms(self) -> float:
-        """Between blocks."""
+        """Time between blocks (ms)."""
         ...
 
 
@@ -124,7 +125,7 @@ class Follower(ABC, Generic[H, L]):
         self._newest = -1  # sequence of the header, beyond 32 bits
         self._next = 0  # sequence to fetch next
         self._last = -1  # sequence of the last sample given
-        self._last_ns = 0  # and its PLC time
+        self._last_ns = 0  # PLC time of the last sample given
         self._break = 0  # Quality bits for the next sample
 
     @abstractmethod
@@ -143,7 +144,7 @@ class Follower(ABC, Generic[H, L]):
         """New samples, as many as fit into the time for one block."""
 
     def samples(self, link: L) -> Iterator[Samples]:
-        """Blocks of what is new, one every interval; ends only by an exception."""
+        """Blocks of new samples, one every interval; ends only by an exception."""
         if self._header is None:
             self._header = self.start(link)
         while True:
@@ -154,13 +155,13 @@ class Follower(ABC, Generic[H, L]):
                 self._clock.sleep(remaining_ns * 1e-9)
 
     def _begin(self, header: H) -> None:
-        """Take the newest record as the first."""
+        """Start at the newest record."""
         self._newest = header.sequence
         self._next, self._last = header.sequence, header.sequence - 1
         self._last_ns = header.time_ns - header.period_ns
 
     def _advance_to(self, header: H) -> None:
-        """Move to ``header``, and note what broke since the last one."""
+        """Move to ``header``, and set flags for breaks since the last one."""
         assert self._header is not None
         self.refuse_other(header)
         scans = header.advance(self._header)

@@ -69,9 +69,9 @@ Tables = Mapping[str, Any]  # nested like [data]
 class Asset(Settings):
     """The ejector: its type (object-specific data) and the one unit (instance-specific data)."""
 
-    type: str = NO_TYPE  # of the ejector, as in the asset database (twin assets list)
-    id: str = ""  # of this one unit, as a calibration stores it
-    batch: str = ""  # of production, as on the nameplate: what fleets are compared by
+    type: str = NO_TYPE  # type of the ejector, as in the asset database (twin assets list)
+    id: str = ""  # ID of this unit, under which a calibration is stored
+    batch: str = ""  # production batch on the nameplate; fleets are compared by it
 
 
 class LogSettings(Settings):
@@ -81,8 +81,10 @@ class LogSettings(Settings):
     keep_days: float | None = Field(
         None, gt=0.0
     )  # older ones are deleted; as long as there is room
-    keep_gb: float | None = Field(None, gt=0.0)  # of all logs of the unit in the folder
-    disk_pct: float = Field(80.0, gt=0.0, le=100.0)  # of the disk in use; beyond it the oldest go
+    # Largest size of all logs of the unit in the folder.
+    keep_gb: float | None = Field(None, gt=0.0)
+    # Used share of the disk beyond which the oldest logs are deleted.
+    disk_pct: float = Field(80.0, gt=0.0, le=100.0)
 
 
 class Known(Settings):

@@ -49,7 +49,7 @@ class ModbusClient:
                 self._connection = self._line.join(self._connected)
 
     def close(self) -> None:
-        """Hang up, or leave the connection to the others that share it."""
+        """Close the connection, unless other clients share it."""
         with self._line.lock:
             connection, self._connection = self._connection, None
             self._line.leave(connection)
@@ -71,7 +71,7 @@ class ModbusClient:
     def write(self, address: Address, values: tuple[int, ...]) -> None:
         """Write words (to coils 0 or 1) from ``address`` on; errors as from ``read``.
 
-        Only hardware in the loop does (drivers/outputs/writer.py).
+        Only hardware in the loop writes (drivers/outputs/writer.py).
         """
         offset, unit = address.offset, self._settings.unit
         question: ModbusPDU

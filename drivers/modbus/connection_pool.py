@@ -15,7 +15,7 @@ from drivers.reconnect import RETRY_S, LostError
 if TYPE_CHECKING:
     from pymodbus.client import ModbusTcpClient
 
-FRESH_S = RETRY_S / 2  # so long a failed attempt of one user counts for all
+FRESH_S = RETRY_S / 2  # s for which a failed attempt of one user counts for all
 
 
 @dataclass
@@ -25,9 +25,9 @@ class Line:
     lock: threading.RLock = field(default_factory=threading.RLock)
     fresh_s: float = FRESH_S
     connection: "ModbusTcpClient | None" = None
-    has_answered: bool = False  # the PLC, at least once over this connection
+    has_answered: bool = False  # whether the PLC has answered over this connection
     users: int = 0
-    failure: LostError | None = None  # of the last try to connect
+    failure: LostError | None = None  # error of the last attempt to connect
     failed_s: float = 0.0
 
     def join(self, connect: "Callable[[], ModbusTcpClient]") -> "ModbusTcpClient":

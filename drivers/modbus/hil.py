@@ -18,7 +18,7 @@ Group = tuple[Address, tuple[int, ...]]  # words, or bits, from there on
 
 
 class Written(Tag):
-    """A value that is written; a register or coil that is listed is ours whole."""
+    """A written value; it takes the whole register or coil."""
 
     @model_validator(mode="after")
     def _can_be_written(self) -> Self:
@@ -53,7 +53,7 @@ class WrittenPressure(Pressure):
 
 
 class HilTags(Settings):
-    """What may be written; what is not listed never is."""
+    """Tags that are written; no other tag ever is."""
 
     pressure: WrittenPressure | None = None
     part_present: Written | None = None  # H2
@@ -64,7 +64,7 @@ class HilTags(Settings):
 class HilSettings(Settings):
     """The ``[hil]`` table beside a Modbus ``[driver]``."""
 
-    min_interval_ms: float = Field(default=5.0, ge=1, le=1000)  # between two writes
+    min_interval_ms: float = Field(default=5.0, ge=1, le=1000)  # shortest time between two writes
     tags: HilTags
 
 

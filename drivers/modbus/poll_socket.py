@@ -35,7 +35,7 @@ class PollSocket:
             _wait_in_the_kernel(self._socket, settings.timeout_ms)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -73,7 +73,7 @@ class PollSocket:
         return data
 
     def _lost(self, request: Request, cause: str) -> LostError:
-        """Close, and give the error: a late answer must not be taken for the next one."""
+        """The error for a lost answer; closes, so that no late answer is taken for the next one."""
         self.close()
         return lost(self._settings.where, request.address, request.count, cause)
 

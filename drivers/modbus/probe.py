@@ -23,7 +23,7 @@ POSSIBLE = 2.0 * MBAR, 17.0 * BAR
 
 
 def probe(settings: ModbusSettings, clock: Clock = REAL) -> list[Line]:
-    """Connect, read everything the settings name, and say what came; never raises SourceError."""
+    """Connect, read all configured values and report each; never raises SourceError."""
     link = ModbusClient(settings)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))

@@ -30,7 +30,7 @@ LONGEST_FETCH_NS = 100_000_000  # then yield what came; no interval is longer
 
 @dataclass(frozen=True)
 class Header(AnyHeader):
-    """What the PLC says about its ring, and of its records."""
+    """The PLC's header of its ring, and the layout of its records."""
 
     record_words: int
     supply: Words  # (1, 1), as its tag declares

@@ -22,13 +22,15 @@ class Tags(Settings):
     suction: Tag | None = None
     blow_off: Tag | None = None
     supply: Pressure | None = None
-    heartbeat: Tag | None = None  # changes at every scan: at rest, the PLC's program stands still
-    nozzle: Tag | None = None  # on; as the ejector itself reports it
-    air_saving: Tag | None = None  # or that it saves air: the nozzle is off under suction
-    part_present: Tag | None = None  # the same: H2 is reached
+    # Number that changes at every scan; at rest, the PLC's program stands still.
+    heartbeat: Tag | None = None
+    nozzle: Tag | None = None  # nozzle on, as the ejector reports it
+    # Air saving active (instead of nozzle): the nozzle is off under suction.
+    air_saving: Tag | None = None
+    part_present: Tag | None = None  # part present (H2 reached), as the ejector reports it
     ambient: Pressure | None = None  # a barometer
-    temperature: Temperature | None = None  # of the gas or the surroundings
-    pressure_2: Pressure | None = None  # at the other end of the line
+    temperature: Temperature | None = None  # temperature of the gas or the surroundings
+    pressure_2: Pressure | None = None  # second pressure at the other end of the line
     flow: Flow | None = None  # suction flow
 
     @model_validator(mode="after")
@@ -44,8 +46,8 @@ class Tags(Settings):
 class Ring(Settings):
     """Where the PLC's trace of its scans lies: header and ring of records."""
 
-    header: Place = Address("holding", 100)  # its first register
-    records: Place = Address("holding", 1000)  # the first register of the ring
+    header: Place = Address("holding", 100)  # first register of the header
+    records: Place = Address("holding", 1000)  # first register of the ring
 
     @model_validator(mode="after")
     def _lies_in_words(self) -> Self:
@@ -58,17 +60,18 @@ class Ring(Settings):
 class ModbusSettings(Settings):
     """The ``[driver]`` table for a Modbus PLC."""
 
-    kind: Literal["modbus"] = "modbus"  # of driver
+    kind: Literal["modbus"] = "modbus"  # kind of driver
     host: str  # name or address of the PLC
-    port: int = Field(default=502, ge=1, le=65535)  # of Modbus TCP
-    unit: int = Field(default=1, ge=0, le=255)  # identifier of the PLC, where a gateway has several
-    # A ring that the PLC fills, or registers read one by one.
+    port: int = Field(default=502, ge=1, le=65535)  # TCP port of the PLC
+    unit: int = Field(default=1, ge=0, le=255)  # unit identifier of the PLC behind a gateway
+    # Read a ring that the PLC fills, or poll registers one by one.
     mode: Literal["block", "poll"] = "block"
-    interval_ms: float = Field(default=30.0, ge=5, le=100)  # between blocks
-    timeout_ms: float = Field(default=200.0, ge=10, le=250)  # longer, and staleness is seen late
+    interval_ms: float = Field(default=30.0, ge=5, le=100)  # time between blocks
+    # Longest time for an answer; a longer one delays staleness.
+    timeout_ms: float = Field(default=200.0, ge=10, le=250)
     gap_ms: int = Field(default=20, ge=1)  # polled: fewer missing slots are no gap
-    word_order: WordOrder = "big"  # of 32-bit values: high word first, or low word first
-    # Absolute, where no barometer is read: gauge pressures count from it.
+    word_order: WordOrder = "big"  # order of a 32-bit value's words: high first, or low first
+    # Absolute ambient pressure without a barometer; gauge pressures count from it.
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     tags: Tags
     ring: Ring = Ring()

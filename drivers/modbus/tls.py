@@ -15,14 +15,14 @@ PORT = 802  # registered for Modbus/TCP Security
 
 # OpenSSL's reasons to reject a certificate (X509_V_ERR_…), as people can put them right.
 _NOT_YET, _EXPIRED, _WRONG_NAME, _WRONG_ADDRESS = 9, 10, 62, 64
-HANDSHAKE_S = 2.0  # a PLC's processor takes its time for it
+HANDSHAKE_S = 2.0  # longest handshake; a PLC's processor is slow
 
 
 class PlcTls(OwnCertificate):
-    """How the connection to the PLC is protected; missing: it is not."""
+    """Protection of the connection to the PLC; without this table there is none."""
 
     trusted: Path  # PEM: the PLC's certificate, or the authority's that signed it
-    name: str = ""  # in the PLC's certificate; "" means the host
+    name: str = ""  # name in the PLC's certificate; "" means the host
 
     def below(self, folder: Path) -> "PlcTls":
         """Give the same with files looked for in ``folder``, unless their paths are absolute."""

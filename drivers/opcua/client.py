@@ -37,8 +37,8 @@ POLICIES = {
     "Aes256Sha256RsaPss": security_policies.SecurityPolicyAes256Sha256RsaPss,
 }
 ENCRYPTED = ua.MessageSecurityMode.SignAndEncrypt
-SESSION_MS = 60_000  # PLCs have few sessions: one that was cut off must not be kept for long
-NEVER_S = 3600.0  # the library's own watch over the connection is not needed
+SESSION_MS = 60_000  # short, since PLCs have few sessions and keep an interrupted one so long
+NEVER_S = 3600.0  # effectively disables the library's own watch over the connection
 
 _S = ua.StatusCodes
 UNKNOWN = {_S.BadNodeIdUnknown, _S.BadNodeIdInvalid}
@@ -64,12 +64,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Subscribed:
-    """What a server granted of a subscription."""
+    """Parameters of a subscription that a server granted."""
 
     publishing_ms: float
-    sampling_ms: float  # of the slowest node
-    queue: int  # of the shortest
-    silence_s: float  # after a longer silence the server counts as lost
+    sampling_ms: float  # sampling interval of the slowest node
+    queue: int  # length of the shortest queue
+    silence_s: float  # longest silence before the server counts as lost
 
 
 class OpcuaClient:
@@ -109,7 +109,7 @@ class OpcuaClient:
             raise
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         runner, client = self._runner, self._client
         self._runner, self._client, self._plans = None, None, {}
         if runner is None:
@@ -345,7 +345,7 @@ class OpcuaClient:
         """Write numbers by one request, each as its node's type; a Boolean is true unless 0.
 
         LostError if no answer comes; SourceError if a node cannot be written or cannot hold its
-        number. Only hardware in the loop does (drivers/opcua/hil.py).
+        number. Only hardware in the loop writes (drivers/opcua/hil.py).
         """
         nodes = tuple(values)
         if nodes not in self._kinds:
@@ -429,7 +429,7 @@ class OpcuaClient:
         return self._lost(action, f"it said {name}")
 
     def _lost(self, action: str, cause: str) -> LostError:
-        """Close, and give the error: a late answer must not be taken for the next one."""
+        """The error for a lost answer; closes, so that no late answer is taken for the next one."""
         self._abandon()
         return LostError(
             f"{self._settings.where}: {action}: {cause}",

@@ -12,14 +12,14 @@ from twin.settings import Settings
 class Signal(Settings):
     """A signal that is written, as the type of its node: a Boolean, or 0 and 1."""
 
-    node: NodeName  # as of other tags
+    node: NodeName  # node as for other tags
 
 
 class Counter(Settings):
     """The watchdog: counts up with each block, and from the high end on from the low one."""
 
-    node: NodeName  # as of other tags
-    range: tuple[int, int] = (0, 32_767)  # it counts from the first to the last, again and again
+    node: NodeName  # node as for other tags
+    range: tuple[int, int] = (0, 32_767)  # first and last count; the first follows the last
 
     @model_validator(mode="after")
     def _counts(self) -> Self:
@@ -37,7 +37,7 @@ class WrittenPressure(NodePressure):
 
 
 class HilTags(Settings):
-    """What may be written; what is not listed never is."""
+    """Tags that are written; no other tag ever is."""
 
     pressure: WrittenPressure | None = None
     part_present: Signal | None = None  # H2
@@ -48,5 +48,5 @@ class HilTags(Settings):
 class HilSettings(Settings):
     """The ``[hil]`` table beside an OPC UA ``[driver]``."""
 
-    min_interval_ms: float = Field(default=10.0, ge=1, le=1000)  # between two writes
+    min_interval_ms: float = Field(default=10.0, ge=1, le=1000)  # shortest time between two writes
     tags: HilTags

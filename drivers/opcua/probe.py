@@ -14,7 +14,7 @@ from twin.errors import SourceError
 
 
 def probe(settings: OpcuaSettings, clock: Clock = REAL) -> list[Line]:
-    """Connect, read everything the settings name, and say what came; never raises SourceError."""
+    """Connect, read all configured values and report each; never raises SourceError."""
     link = OpcuaClient(settings, clock)
     try:
         connected = looked_at("connection", lambda: _connect(link, settings, clock))
@@ -59,7 +59,7 @@ def _node_text(link: OpcuaClient, node: Node) -> str:
 
 
 def _granted(link: OpcuaClient, subscription: Subscription, settings: OpcuaSettings) -> str:
-    """What the server grants; SourceError if it samples too seldom to see anything."""
+    """The granted sampling, in words; SourceError if it is too slow for a cycle."""
     link.open()
     granted = link.subscribe(subscription.nodes, subscription.queue)
     text = (

@@ -89,7 +89,7 @@ class GuardedServer(InternalServer):  # type: ignore[misc]
 
 
 class Door:
-    """Authenticates clients for the library; ``say`` receives what prevents a login."""
+    """Authenticates clients for the library; ``say`` receives the reasons that prevent a login."""
 
     def __init__(self, folder: Path | None, authenticator: Authenticator | None, say: Say) -> None:
         self._authenticator, self._say = authenticator, say

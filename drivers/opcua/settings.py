@@ -1,4 +1,4 @@
-"""The ``[driver]`` table for an OPC UA server: where it is, its nodes, and who we are to it."""
+"""The ``[driver]`` table for an OPC UA server: its address, its nodes, and our identity."""
 
 import re
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ NODE = re.compile(r"(?:nsu=(?P<uri>[^;]+);)?(?P<identifier>[sigb]=.+)", re.DOTAL
 class Node:
     """A node as a configuration names it; "" as URI means the driver's ``namespace``."""
 
-    identifier: str  # with its kind, as "s=Meas.Pressure"
+    identifier: str  # identifier with its kind, such as "s=Meas.Pressure"
     uri: str = ""
 
     @classmethod
@@ -61,25 +61,25 @@ class NodeTag(Settings):
     """A value in the server that is on or off: a Boolean, or a bit of a number."""
 
     node: NodeName  # "s=Name", or with its namespace "nsu=URI;s=Name"
-    bit: int | None = Field(default=None, ge=0, le=63)  # of a number, 0 the lowest
+    bit: int | None = Field(default=None, ge=0, le=63)  # bit of a number, 0 the lowest
 
 
 class NodePressure(Quantity):
     """A pressure in the server: a number, and what it means."""
 
-    node: NodeName  # as of other tags
+    node: NodeName  # node as for the other tags
 
 
 class NodeTemperature(Thermometer):
     """A temperature in the server."""
 
-    node: NodeName  # as of other tags
+    node: NodeName  # node as for the other tags
 
 
 class NodeFlow(Flowmeter):
     """A suction flow in the server."""
 
-    node: NodeName  # as of other tags
+    node: NodeName  # node as for the other tags
 
 
 class NodeTags(Settings):
@@ -89,12 +89,13 @@ class NodeTags(Settings):
     suction: NodeTag | None = None
     blow_off: NodeTag | None = None
     supply: NodePressure | None = None
-    nozzle: NodeTag | None = None  # on; as the ejector itself reports it
-    air_saving: NodeTag | None = None  # or that it saves air: the nozzle is off under suction
-    part_present: NodeTag | None = None  # the same: H2 is reached
+    nozzle: NodeTag | None = None  # nozzle on, as the ejector reports it
+    # Air saving active (instead of nozzle): the nozzle is off under suction.
+    air_saving: NodeTag | None = None
+    part_present: NodeTag | None = None  # part present (H2 reached), as the ejector reports it
     ambient: NodePressure | None = None  # a barometer
-    temperature: NodeTemperature | None = None  # of the gas or the surroundings
-    pressure_2: NodePressure | None = None  # at the other end of the line
+    temperature: NodeTemperature | None = None  # temperature of the gas or the surroundings
+    pressure_2: NodePressure | None = None  # second pressure at the other end of the line
     flow: NodeFlow | None = None  # suction flow
 
     @model_validator(mode="after")
@@ -106,21 +107,23 @@ class NodeTags(Settings):
 class TraceNodes(Settings):
     """The PLC's trace of its scans: where it stands, and its ring as arrays of one length."""
 
-    sequence: NodeName = Node("s=Trace.Sequence")  # of the newest complete record, 32 bits
-    time: NodeName = Node("s=Trace.Time")  # of that record: ns since 1970, or a DateTime
-    boot: NodeName = Node("s=Trace.Boot")  # differs after every restart
-    period: NodeName = Node("s=Trace.Period")  # of the scans, µs
-    sequences: NodeName = Node("s=Trace.Sequences")  # scan s at s mod length
+    # Sequence number of the newest complete record, 32 bits.
+    sequence: NodeName = Node("s=Trace.Sequence")
+    time: NodeName = Node("s=Trace.Time")  # time of that record: ns since 1970, or a DateTime
+    boot: NodeName = Node("s=Trace.Boot")  # number that changes at every restart
+    period: NodeName = Node("s=Trace.Period")  # period of the scans, µs
+    sequences: NodeName = Node("s=Trace.Sequences")  # sequence numbers; scan s is at s mod length
     statuses: NodeName = Node("s=Trace.Statuses")  # bits 0 suction, 1 blow-off, 8 overflow
-    pressures: NodeName = Node("s=Trace.Pressures")  # as tags.pressure says
+    pressures: NodeName = Node("s=Trace.Pressures")  # pressures, scaled as in tags.pressure
 
 
 class Security(Settings):
-    """How the connection is protected. With a policy, all is signed and encrypted."""
+    """Protection of the connection. With a policy, all messages are signed and encrypted."""
 
-    # What is signed and encrypted with.
+    # Security policy by which messages are signed and encrypted.
     policy: Literal["None", "Basic256Sha256", "Aes256Sha256RsaPss"] = "None"
-    certificates: Path | None = None  # folder that twin cert makes: ours, and whom we trust
+    # Folder made by twin cert: our certificate, and the trusted ones.
+    certificates: Path | None = None
 
     @model_validator(mode="after")
     def _has_certificates(self) -> Self:
@@ -130,9 +133,9 @@ class Security(Settings):
 
 
 class User(Settings):
-    """Who we are to the server: nobody, a name and password, or a certificate."""
+    """Identity for the server: anonymous, a name with a password, or a certificate."""
 
-    name: str = ""  # with a password
+    name: str = ""  # user name, with a password
     password: Secret | None = None
     certificate: Path | None = None  # PEM, instead of a name
     key: Path | None = None  # PEM, of that certificate
@@ -151,16 +154,18 @@ class User(Settings):
 class OpcuaSettings(Settings):
     """The ``[driver]`` table for a PLC behind an OPC UA server."""
 
-    kind: Literal["opcua"] = "opcua"  # of driver
+    kind: Literal["opcua"] = "opcua"  # kind of driver
     url: str  # opc.tcp://HOST:PORT
-    namespace: str = ""  # URI of the nodes' namespace; needed where they do not name it
-    # A trace that the PLC keeps, or values as they change.
+    namespace: str = ""  # URI of the nodes' namespace; required where nodes do not name it
+    # Read a trace that the PLC keeps, or subscribe to values.
     mode: Literal["block", "subscribe"] = "block"
-    interval_ms: float = Field(default=50.0, ge=5, le=1000)  # between blocks, of publishing
-    sampling_ms: float = Field(default=1.0, ge=0.1, le=1000)  # subscribed: asked of the server
-    timeout_ms: float = Field(default=2000.0, ge=50, le=20_000)  # of one answer
-    gap_ms: float = Field(default=20.0, ge=1)  # subscribed: less missing is no gap
-    # Absolute, where no barometer is read: gauge pressures count from it.
+    # Time between blocks, or between publications.
+    interval_ms: float = Field(default=50.0, ge=5, le=1000)
+    # Sampling interval requested from the server (subscribe).
+    sampling_ms: float = Field(default=1.0, ge=0.1, le=1000)
+    timeout_ms: float = Field(default=2000.0, ge=50, le=20_000)  # longest time for an answer
+    gap_ms: float = Field(default=20.0, ge=1)  # shorter gaps in a subscription are not flagged
+    # Absolute ambient pressure without a barometer; gauge pressures count from it.
     ambient_mbar: float = Field(default=1013.25, ge=500, le=1200)
     security: Security = Security()
     user: User = User()

@@ -46,13 +46,13 @@ class Column:
     codes: list[int] = field(default_factory=list)
 
     def add(self, at_ns: int, value: float, code: int) -> None:
-        """Append one."""
+        """Append a value."""
         self.times.append(at_ns)
         self.values.append(value)
         self.codes.append(code)
 
     def keep_last(self) -> None:
-        """Forget all but the newest, which still holds."""
+        """Drop all values but the newest, which is still in force."""
         del self.times[:-1], self.values[:-1], self.codes[:-1]
 
     def at(self, times: Integers) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
@@ -67,7 +67,7 @@ class Column:
 
 
 class Subscription:
-    """What one PLC publishes; it outlives connections."""
+    """The subscription to one PLC's values; it outlives connections."""
 
     def __init__(self, settings: OpcuaSettings, clock: Clock) -> None:
         tags = settings.tags
@@ -85,7 +85,7 @@ class Subscription:
         self._period_ns = 0  # of samples, as granted
         self._published = 0  # number of the last publication with values; 0: none yet
         self._sequence = -1  # of the last row
-        self._last_ns = 0  # and its source time
+        self._last_ns = 0  # source time of the last row
         self._break = 0  # Quality bits for the next row
 
     def samples(self, link: OpcuaClient) -> Iterator[Samples]:

@@ -44,7 +44,7 @@ BEYOND = {ua.StatusCodes.UncertainEngineeringUnitsExceeded, ua.StatusCodes.BadOu
 
 
 def code_of(value: ua.DataValue) -> int:
-    """Its StatusCode; a missing one means good."""
+    """The StatusCode of a value; a missing one means good."""
     return int(value.StatusCode.value) if value.StatusCode is not None else 0
 
 
@@ -65,7 +65,7 @@ def lost_some(code: int) -> bool:
 
 
 def status_name(code: int) -> str:
-    """As the standard names it."""
+    """Name of a StatusCode in the standard."""
     return str(ua.StatusCode(code & CODE).name)
 
 
@@ -84,7 +84,7 @@ def nanoseconds(stamp: datetime) -> int:
 
 
 def readable(value: ua.DataValue) -> bool:
-    """Whether there is a value at all, good or not."""
+    """Whether there is a value, of whatever quality."""
     return value.Value is not None and value.Value.Value is not None
 
 

@@ -34,7 +34,7 @@ _KEPT_EVENTS = 16  # events of a condition by which it can be acknowledged
 _T, _S, _I = ua.VariantType, ua.StatusCodes, ua.ObjectIds
 
 
-# --- who calls ----------------------------------------------------------------------------------
+# --- the caller of a method ---------------------------------------------------------------------
 
 CALLER: ContextVar[Person | None] = ContextVar("caller", default=None)
 

@@ -88,7 +88,7 @@ class Branch:
 
 
 class Asking:
-    """Asks the process that has the alarms to acknowledge them, and waits for its answer."""
+    """Asks the process that holds the alarms to acknowledge them, and waits for its answer."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._sending = pipe, threading.Lock()
@@ -259,7 +259,7 @@ STATES: Sequence[tuple[str, str, list[str]]] = (
 )
 
 
-# --- what a client may ask for -----------------------------------------------------------------
+# --- limits for clients -------------------------------------------------------------------------
 
 MOST_CONNECTIONS = 32
 MOST_CHUNK = 65_535  # bytes; the library keeps at most one incomplete chunk

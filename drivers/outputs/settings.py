@@ -1,4 +1,4 @@
-"""The ``[results]`` table: whether others may read what the twin finds, where, and who."""
+"""The ``[results]`` table: the OPC UA server of the twin's results, and access to it."""
 
 import ipaddress
 from pathlib import Path
@@ -19,12 +19,13 @@ class ResultsSettings(Settings):
     """Off unless ``opcua`` is set, and for this machine alone unless it is protected."""
 
     opcua: bool = False  # whether results are served
-    host: str = "127.0.0.1"  # where; beyond this machine only protected
+    host: str = "127.0.0.1"  # address that it listens on; beyond this machine only with security
     port: int = Field(default=4841, ge=0, le=65535)  # 0 takes any free one
-    interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # between two values
-    policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)  # that clients may use
+    interval_ms: float = Field(default=100.0, ge=20, le=10_000)  # shortest time between two values
+    # Security policies that clients may use.
+    policies: tuple[Policy, ...] = Field(default=("None",), min_length=1)
     certificates: Path | None = None  # a folder as twin cert makes it; the same as the driver's
-    users: UsersFile | None = None  # as twin users makes it; with one, everybody logs in
+    users: UsersFile | None = None  # file of twin users; with one, every client must log in
     unprotected: bool = False  # beyond this machine without a policy all the same
 
     @model_validator(mode="after")

@@ -198,7 +198,7 @@ class Fault:
 
     effect: str
     parameter: Parameter
-    value: float  # in the parameter's unit
+    value: float  # size in the parameter's unit
     start_s: float = 0.0
     start_cycle: int | None = None
     ramp_s: float = 0.0

@@ -13,7 +13,7 @@ class DatabaseSettings(Settings):
     """Which database; a file beside the configuration where nothing is said."""
 
     url: str = ""  # or the path of an SQLite file, from the configuration's folder
-    password: Secret | None = None  # of the user in the URL, for a server that asks for one
+    password: Secret | None = None  # password of the user in the URL, if the server requires one
 
     @field_validator("url")
     @classmethod

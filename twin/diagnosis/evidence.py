@@ -1,4 +1,4 @@
-"""Evidence of a log: its complete cycles, and the residuals of any hypothesis in them.
+"""The complete cycles of a log, and the residuals of any hypothesis in them.
 
 A hypothesis is a set of causes; the calibrated twin as it stands is the empty one. Its residuals
 are measured minus expected pressure, averaged over short bins, and measured minus expected vacuum
@@ -59,10 +59,10 @@ from twin.signals import (
 )
 
 OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
-CORES: ContextVar[int] = ContextVar("CORES", default=2)  # on which a diagnosis runs
-NEARBY = 0.1  # sigmas of a data set's uncertainty, within which the model is straight
-FASTEST, PIECE = 1, 100_000  # zlib's level, with which a row takes 4 bytes; rows of a piece
-LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles, and at most (rows)
+CORES: ContextVar[int] = ContextVar("CORES", default=2)  # number of cores for a diagnosis
+NEARBY = 0.1  # sigmas of a data set's uncertainty within which the response is linear
+FASTEST, PIECE = 1, 100_000  # zlib's level, at which a row takes 4 bytes; rows of a piece
+LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles; largest, in rows
 
 Phases = npt.NDArray[np.uint8]
 Hypothesis = tuple[Cause, ...]
@@ -72,7 +72,7 @@ Result = TypeVar("Result")
 
 
 def at_once(run: Callable[[Item], Result], over: Sequence[Item]) -> list[Result]:
-    """Results of ``run`` for each, in order; in threads, as compiled code releases the lock."""
+    """Results of ``run`` in order; uses threads, since compiled code releases the lock."""
     if len(over) < 2 or CORES.get() == 1:
         return [run(item) for item in over]
     with ThreadPoolExecutor(CORES.get()) as pool:
@@ -82,37 +82,37 @@ def at_once(run: Callable[[Item], Result], over: Sequence[Item]) -> list[Result]
 class LeftOpen(NamedTuple):
     """Changes of healthy bins (mbar) by each uncertainty of the data set, (bins, uncertainties)."""
 
-    nearby: Floats  # by one sigma, as a small part of it does
-    up: Floats  # by a whole sigma to either side
+    nearby: Floats  # linear response to one sigma
+    up: Floats  # by a whole sigma up, then down
     down: Floats
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The complete cycles of a log in one stretch of rows, and all that judges a hypothesis."""
+    """The complete cycles of a log in one stretch of rows, and the model for hypotheses."""
 
-    theta: Theta  # of the calibrated twin as it stands, in the surroundings of the log
+    theta: Theta  # coefficients of the calibrated twin in the surroundings of the log
     begin_ns: int  # PLC time of the first of these rows
-    before_s: float  # of the log, before that row
+    before_s: float  # duration of the log before that row
     samples: Samples
     ticks: Ticks
     starts: Ints  # first row of each cycle, and the row after the last one
-    numbers: Ints  # of the cycles in the log
-    judged: list[int]  # positions of cycles that count; in the others the model still settles
-    figures: list[dict[str, float]]  # of each cycle
+    numbers: Ints  # number of each cycle in the log
+    judged: list[int]  # positions of cycles that count; in the others the model settles
+    figures: list[dict[str, float]]  # figures of each cycle
     healthy: Healthy
-    noise: float  # mbar
+    noise: float  # mbar, of a row
     bins: Bins
-    terms: tuple[Term, ...]  # of the data set, learned from data
-    knees: Knees  # settings with which they were found
-    uncertain: tuple[Shift, ...]  # what is open of the data set
+    terms: tuple[Term, ...]  # empirical terms of the data set
+    knees: Knees  # settings of the detector that found the switchings
+    uncertain: tuple[Shift, ...]  # uncertainties of the data set, one sigma each
     rows: Ints  # subsampled for interpolation of the expected pressure
     calibrated: Theta  # ``theta`` in the surroundings of the calibration
     told: frozenset[str] = frozenset()  # measured surroundings
     another_day: bool = True  # the log is of another day than the calibration
-    volumes_within: float = 1.0  # factor to the true volumes, as told
-    catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # beside the table
-    _seen: dict[bytes, Seen] = field(default_factory=dict)  # by coefficients
+    volumes_within: float = 1.0  # accuracy factor (95 %) of the volumes in the data set
+    catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # stored effects
+    _seen: dict[bytes, Seen] = field(default_factory=dict)  # cache by coefficients
 
     @property
     def cycles(self) -> int:
@@ -120,7 +120,7 @@ class Evidence:
         return len(self.starts) - 1
 
     def only(self, cycles: Sequence[int], judged: list[int]) -> "Evidence":
-        """Evidence of some of these cycles; ``judged`` are positions among them."""
+        """Evidence with only some of these cycles; ``judged`` are positions among them."""
         parts = [slice(*self.starts[cycle : cycle + 2]) for cycle in cycles]
         return _of_rows(
             self,
@@ -144,7 +144,7 @@ class Evidence:
 
     @cached_property
     def least_time_ms(self) -> float:
-        """One sigma of the time of a command, as far as the rows show it."""
+        """One sigma (ms) of a command's time, due to the sampling of rows."""
         return least_time_ms(sampling_ms(self.samples))
 
     @cached_property
@@ -210,7 +210,7 @@ class Evidence:
 
     @cached_property
     def left_open(self) -> LeftOpen:
-        """What the calibration left open of the twin without causes."""
+        """Responses of the twin without causes to each uncertainty of its data set."""
         ups, downs = ([getattr(shift, side) for shift in self.uncertain] for side in ("up", "down"))
         near = [self.theta + NEARBY * (up - self.theta) for up in ups]
         bases = [self.theta, *near, *ups, *downs]
@@ -220,7 +220,7 @@ class Evidence:
 
     def _drawn(self, courses: Sequence[Schedule], phase: Phases) -> Ints:
         """Subsampled rows for interpolation of the pressure expected by these courses."""
-        if self.terms:  # they need every row
+        if self.terms:  # terms need every row
             return np.arange(len(phase))
         changes = np.concatenate(
             [
@@ -238,7 +238,7 @@ class Evidence:
         rows: Ints,
         tolerance: float,
     ) -> Floats:
-        """Expected pressures (Pa) at ``rows``, (rows, courses); the rest is given there."""
+        """Expected pressures (Pa) at ``rows``, (rows, courses); inputs are given at these rows."""
         dt = np.diff(self._times[rows], prepend=0.0)
         expected = np.empty((len(rows), len(courses)))
         state, before = kernel.new_state(len(courses)), None
@@ -285,7 +285,7 @@ class Evidence:
         return stretches
 
     def _phases(self, sensing: Sequence[tuple["Sensing", ...]]) -> Phases:
-        """Phases of all rows for which the nozzle would be seen to switch as it was.
+        """Phases of all rows with which the detector would have found the same switchings.
 
         They are (rows, n), or (rows, 1) if they are the same for all.
         """
@@ -299,7 +299,7 @@ class Evidence:
     def _levels(
         self, rows: Ints, courses: Sequence[Schedule], sensing: Sequence[tuple["Sensing", ...]]
     ) -> Floats:
-        """Levels at ``rows``, as ``_phases``; all rows with a level have to be among them."""
+        """Levels at ``rows``, shaped as ``_phases``; ``rows`` contain all rows with a level."""
         changed = any(len(course) > 1 for course in courses)
         width = len(sensing) if changed or any(sensing) else 1
         level = np.repeat(self.ticks["level"][rows].astype(np.float64)[:, None], width, axis=1)
@@ -314,7 +314,7 @@ class Evidence:
     def _given_sooner(
         self, sooner: Sequence[bool], courses: Sequence[Schedule], phase: Phases, level: Floats
     ) -> tuple[Sequence[Schedule], Phases, Floats]:
-        """Drives of the kernel, if valves of some courses act before their commands are seen.
+        """Inputs of the kernel if valves of some courses act before their commands show in a row.
 
         Commands of the courses that are ``sooner`` come a row sooner, and their delays are longer
         by that. A negative delay is thus exact, if it is shorter than a row. ``phase`` and
@@ -336,7 +336,7 @@ class Evidence:
         return driven, phase, level
 
     def _read_anew(self, rows: Ints, level: Floats, course: Schedule) -> None:
-        """Correct levels at a cycle's start for coefficients of the sensor that change there."""
+        """Correct levels at starts of cycles where a course changes coefficients of the sensor."""
         for (_, before), (row, after) in pairwise(course):
             at = np.searchsorted(rows, row)
             if np.isfinite(level[at]) and self.ticks["phase"][row - 1] == Phase.IDLE:
@@ -355,7 +355,7 @@ class Evidence:
             late[late == name] = _OTHER[name]
 
     def _known_shift(self, knee: int) -> int:
-        """Rows by which a knee shows late; none if the slope did not show it, but the whole log."""
+        """Rows by which a breakpoint shows late; 0 if it was found by the whole log instead."""
         name = self.ticks["phase"][knee]
         shift = self.knees.off_shift if name == Phase.HOLD else self.knees.on_shift
         return shift if shift and self.ticks["phase"][knee - 1] == name else 0
@@ -372,7 +372,7 @@ class Evidence:
 
     @cached_property
     def _knees(self) -> Ints:
-        """Rows at which the air saving was seen to switch."""
+        """Rows at which the detector saw the air saving switch."""
         phase = self.ticks["phase"]
         rows = np.flatnonzero(np.isfinite(self.ticks["level"]))
         rows = rows[rows > 0]
@@ -380,18 +380,18 @@ class Evidence:
         return rows[np.isin(phase[rows], inside) & np.isin(phase[rows - 1], inside)]
 
     def knee(self, cycle: int, into: Phase) -> int:
-        """First row of a cycle at which the air saving was seen to switch to a phase."""
+        """First row of a cycle at which the detector saw a switching to a phase."""
         knees = self._knees[self._knees >= self.starts[cycle]]
         return int(knees[self.ticks["phase"][knees] == into][0])
 
     def seen(self, theta: Theta) -> Seen:
-        """Simulated detection of the switching, by the same finder as in the log; cached."""
+        """Simulated detection of the switching by the log's detector; cached."""
         if theta.tobytes() not in self._seen:
             self.look([theta])
         return self._seen[theta.tobytes()]
 
     def look(self, thetas: Iterable[Theta]) -> None:
-        """Simulate the detection of the switching for many coefficients, and cache it."""
+        """Simulate and cache the detection of the switching for many coefficients."""
         new = {theta.tobytes(): theta for theta in thetas}
         new = {key: theta for key, theta in new.items() if key not in self._seen}
         if not new:
@@ -407,17 +407,17 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Sensing:
-    """Shifts against the calibrated twin for which the switching shows when it did."""
+    """Shifts against the calibrated twin with which the switching shows at the same row."""
 
-    row: int  # from which they hold
+    row: int  # first row with these shifts
     off: int  # rows by which the nozzle closes earlier
     on: int  # rows by which it opens earlier
-    off_above: float  # Pa, increase of the level found over the reading there
+    off_above: float  # Pa, increase of the detected level over the reading there
     on_above: float
 
     @classmethod
     def of(cls, row: int, changed: Seen, calibrated: Seen) -> "Sensing":
-        """Compare with the calibrated twin."""
+        """Shifts between two simulated detections, ``changed`` and ``calibrated``."""
         return cls(
             row,
             changed.off_rows - calibrated.off_rows,
@@ -434,7 +434,7 @@ _SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]  # a drop along the line 
 
 
 def _after(theta: Theta, period: float) -> Theta:
-    """Coefficients for commands that come ``period`` (s) sooner: all happens when it did."""
+    """Coefficients for commands that come ``period`` (s) sooner, with all actions unchanged."""
     later = theta.copy()
     later[_DELAYS] += period
     later[c.CONTACT] += period * (theta[c.CONTACT] > 0.0)
@@ -442,7 +442,7 @@ def _after(theta: Theta, period: float) -> Theta:
 
 
 def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:
-    """``sensing`` with knees later by ``rows``."""
+    """``sensing`` with breakpoints later by ``rows``."""
     if not rows:
         return sensing
     shifts = sensing or (Sensing(0, 0, 0, 0.0, 0.0),)
@@ -464,17 +464,17 @@ def _constant_stretches(courses: Sequence[Schedule], rows: int) -> Iterator[tupl
 
 @dataclass(frozen=True)
 class LogCycles:
-    """The complete cycles of a log, compressed, as an hour has 3.6 million rows.
+    """The complete cycles of a log, compressed, since an hour has 3.6 million rows.
 
     Evidence is made of some of them at a time.
     """
 
-    base: Evidence  # of none of them
+    base: Evidence  # evidence without cycles
     begins: Floats  # time (s) of the first row of each, since the first row of the log
     judged: list[int]  # as in Evidence
     figures: list[dict[str, float]]
-    saturated: float  # share of their rows
-    packed: list[list[bytes]]  # of each, in pieces
+    saturated: float  # share of saturated rows
+    packed: list[list[bytes]]  # compressed pieces of each cycle
 
     @property
     def cycles(self) -> int:
@@ -488,7 +488,7 @@ class LogCycles:
         return samples, ticks
 
     def whole(self) -> Evidence:
-        """Evidence of all cycles: all rows are held in memory."""
+        """Evidence of all cycles; all rows are held in memory."""
         return self.only(range(self.cycles), self.judged)
 
     def only(self, cycles: Sequence[int], judged: list[int]) -> Evidence:
@@ -565,7 +565,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         told=frozenset(medians),
         knees=knees,
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
-        _seen={},  # depends on the settings of the finder
+        _seen={},  # depends on the settings of the detector
     )
     begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
@@ -587,14 +587,14 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
 
 
 def _packed(samples: Samples, ticks: Ticks) -> list[bytes]:
-    """Rows compressed without loss, in pieces: a cycle may last a night."""
+    """Rows compressed without loss, in pieces, since a cycle may last a night."""
     parts = [slice(first, first + PIECE) for first in range(0, len(samples), PIECE)]
     return [zlib.compress(encode(samples[part], ticks[part]), FASTEST) for part in parts]
 
 
 @dataclass(frozen=True)
 class _Bridged:
-    """Blocks passed through a ``Bridge``, again and again."""
+    """Blocks passed through a ``Bridge``, as often as they are read."""
 
     blocks: Iterable[Samples]
 
@@ -611,7 +611,7 @@ def thinned(source: Evidence | LogCycles, cycles: Sequence[int], most: int) -> E
 
 
 def of_cycles(source: Evidence | LogCycles, cycles: Sequence[int]) -> Evidence:
-    """Evidence of some cycles and the one before each, in which the model settles."""
+    """Evidence of some cycles, each with the cycle before it, in which the model settles."""
     kept = sorted({number for cycle in cycles for number in (cycle - 1, cycle) if number >= 0})
     return source.only(kept, [kept.index(cycle) for cycle in cycles])
 
@@ -623,7 +623,7 @@ def _of_rows(
     judged: list[int],
     figures: list[dict[str, float]],
 ) -> Evidence:
-    """Evidence of cycles whose rows are given, for the twin of ``base``."""
+    """Evidence of cycles with these ``rows``, for the twin of ``base``."""
     samples = joined(np.empty(0, SAMPLE), *(samples for samples, _ in rows))
     ticks = joined(np.empty(0, TICK), *(ticks for _, ticks in rows))
     starts = np.cumsum([0, *(len(samples) for samples, _ in rows)])
@@ -652,7 +652,7 @@ def _binned(
 
 
 def _unsettled(phase: Phases, knees: Knees) -> npt.NDArray[np.bool_]:
-    """Rows after a knee that was too close to the end of suction to be found well.
+    """Rows after a breakpoint that is too close to the end of suction to be precise.
 
     Rows of the blow-off or idle after them count as well: its initial pressure is unknown.
     """

@@ -1,7 +1,7 @@
-"""The next measurement: the recording that would separate causes this log cannot tell apart.
+"""The next measurement: a recording that would separate causes that this log cannot tell apart.
 
-Each test that a rig engineer can do is simulated with the causes found; then every look-alike is
-fitted to it as to a log. Its residual, in sigmas, is the separation that the test would give.
+Each test that a rig engineer can do is simulated with the found causes. Every look-alike is then
+fitted to it as to a log. The residual, in sigmas, is the separation by the test.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,10 +21,10 @@ from twin.model.theta import Theta
 from twin.signals import BAR, MS, SAMPLE, Command, Samples
 
 ENOUGH = 5.0  # sigmas that separate two causes for certain
-REPEATS = 4  # of a test: the model settles in the first
+REPEATS = 4  # cycles of a test; the model settles in the first
 MOST_RIVALS = 3
 SUPPLY_STEP = 1.0 * BAR
-HIDES = 1.0  # rms of what looks like another weather, over what healthy cycles leave
+HIDES = 1.0  # rms of the deviation that weather explains, over that of healthy cycles
 
 _OFF, _SUCTION, _BLOW = 0, int(Command.SUCTION), int(Command.BLOW_OFF)
 Program = Sequence[tuple[int, int]]  # command, ms
@@ -52,7 +52,7 @@ def _less_supply(theta: Theta) -> None:
 
 
 _CYCLE = ((_SUCTION, 1500), (_BLOW, 300), (_OFF, 700))
-# The cheapest first.
+# Tests in order of cost, the cheapest first.
 TESTS = (
     Test(
         "six short bursts of suction (60 ms) and of blow-off (60 ms), 0.4 s apart",
@@ -81,9 +81,9 @@ TESTS = (
 def next_experiment(
     evidence: Evidence, searched: Search, mechanism: Explained | None = None
 ) -> str | None:
-    """What to record to separate causes that this log cannot tell apart; None without rivals.
+    """The recording that separates causes this log cannot tell apart; None without rivals.
 
-    With a ``mechanism``, what separates that from its rivals.
+    With a ``mechanism``, the recording separates it from its rivals.
     """
     if mechanism is not None:
         alternatives = [(*mechanism.beside, rival) for rival in mechanism.rivals[:1]]  # the nearest
@@ -106,9 +106,9 @@ def next_experiment(
 
 
 def beside_weather(evidence: Evidence, healthy: Covariance) -> str | None:
-    """What to measure if a ``consistent`` log deviates as another weather does; else None.
+    """What to measure if a ``consistent`` log deviates as under another weather; else None.
 
-    Then it is consistent because nobody measured the weather, and a fault could hide behind that.
+    Such a log is consistent only because nobody measured the weather. A fault could hide in it.
     """
     unmeasured = [name for name in ("ambient", "temperature") if name not in evidence.told]
     if not unmeasured:
@@ -128,7 +128,7 @@ def beside_weather(evidence: Evidence, healthy: Covariance) -> str | None:
 def _recording(
     evidence: Evidence, hypothesis: Hypothesis, rivals: Sequence[Hypothesis], text: str, names: str
 ) -> str | None:
-    """The cheapest test that separates what was found from its rivals, or the best one."""
+    """The cheapest test that separates a hypothesis from its rivals, or the best one."""
     if not rivals:
         return None
     settled, settled_rivals = (
@@ -166,7 +166,7 @@ def _settled(evidence: Evidence, hypothesis: Hypothesis) -> Hypothesis:
 def _separation(
     evidence: Evidence, hypothesis: Hypothesis, rivals: Sequence[Hypothesis], test: Test
 ) -> float:
-    """Sigmas by which a test would separate the causes found from their nearest rival."""
+    """Sigmas by which a test would separate the found causes from their nearest rival."""
     theta = evidence.theta.copy()
     test.change(theta)
     base = replace(evidence, theta=theta, uncertain=(), _seen={})

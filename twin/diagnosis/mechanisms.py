@@ -1,6 +1,6 @@
 """Mechanisms for something unlisted: where it acts on the plant, when and how.
 
-Each combination of a place and a way of acting is tried in the same model as the listed effects,
+Each combination of place, condition and speed is tried in the same model as the listed effects,
 alone and beside the causes. A linear screening with a small size ranks them. The best are fitted
 with all their parameters and compared by misfit plus penalty. Held-out cycles are not used.
 """
@@ -25,39 +25,39 @@ from twin.monitor.bins import Floats
 
 Progress = Callable[[str], None]
 
-TRIED_LARGER, FITTED = 40, 8  # starts tried at their linear size, mechanisms fitted
+TRIED_LARGER, FITTED = 40, 8  # starts tried at their linear size; mechanisms fitted
 # Sizes of the linear screening, in typical ones. The larger one is added if the deviation exceeds
 # GROSS sigmas (rms), since the response is then far from linear.
 PROBES, GROSS = (1.0, 5.0), 5.0
-AROUND = (0.5, 1.0, 2.0)  # times the size from the linear screening
+AROUND = (0.5, 1.0, 2.0)  # sizes tried, over that of the linear screening
 # Largest share of the squared deviation beyond healthy cycles, in sigmas and in mbar, that a
 # mechanism may leave on fitted cycles. Chosen: effects of the second world leave up to a tenth.
 MOST_LEFT = 0.3
-# One that leaves less than NEARLY_ALL in sigmas may leave HALF in mbar: where the data set does not
-# know how end pressure follows supply, that is most of them. Chosen: a swinging supply, found to
-# 0.3 % in size and period, leaves 0.02 in sigmas and 0.37 in mbar.
+# A mechanism that leaves less than NEARLY_ALL in sigmas may leave HALF in mbar: if the law from
+# supply to end pressure is uncertain, it causes most of these mbar. Chosen: a swinging supply,
+# found to 0.3 % in size and period, leaves 0.02 in sigmas and 0.37 in mbar.
 NEARLY_ALL = 0.1
-# A mechanism alone replaces listed causes if it leaves less than this share of what they leave
-# (mbar², beyond healthy cycles). Chosen: icing leaves 0.53 of what end vacuum loss with a porous
-# leak leaves, which mimic it.
+# A mechanism alone replaces listed causes if its mean square residual is below this share of theirs
+# (mbar², beyond healthy cycles). Chosen: icing has 0.53 of the residual of end vacuum loss with a
+# porous leak, which mimic it.
 DISPLACES = 0.6
-# If listed causes leave no more than healthy cycles have, a mechanism replaces them only if it is
-# better by LIKELIER in chi-square (each with its own weights) and leaves less than HALF of their
-# mbar². Chosen: a lifting lip is 115 better than the porous leak that mimics it, with 0.24.
+# If the residual of listed causes is healthy, a mechanism replaces them only if its chi-square
+# (with its own weights) is lower by LIKELIER and its residual is below HALF of theirs (mbar²).
+# Chosen: a lifting lip is 115 better than the porous leak that mimics it, at 0.24 of its residual.
 LIKELIER, HALF = 30.0, 0.5
 # Share of the usual deviation (mbar rms) by which mechanisms must differ to be told apart. Chosen
 # on a lifting lip: an opening above some vacuum is 0.26 from seepage and 0.35 from an inflow above
 # it, and 0.54 to 0.6 from one that gathers. Calibrations differ in whether opening or seepage wins.
 APART = 0.5
-# A level is crossed between two rows, so the misfit has steps over it, and a fit stops at a step.
-# Changes of levels (in typical ones) that are tried from there, and how often.
+# A threshold is crossed between two rows, so the misfit is a step function of it, and a fit stops
+# at a step. Changes of thresholds (in typical sizes) that are tried from there, and rounds of it.
 AFAR, LEAPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0), 4
-# Rhythms are looked for at frequencies half a line width (1 / duration) apart: a fit that begins
-# farther from a line does not reach it. MOST_FREQUENCIES bounds the time on a long log, in which
-# then the fastest rhythms are not looked for.
+# The periodogram has frequencies half a line width (1 / duration) apart: a fit that begins farther
+# from a line does not reach it. MOST_FREQUENCIES bounds the computing time; on a long log the
+# fastest rhythms are then not searched.
 PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 400, 3
-# Share of the squared deviation (mbar) that must differ from cycle to cycle for a rhythm to be
-# looked for. Chosen: a swinging supply has 0.3 to 0.8; leaks, vapour and ice up to 0.06.
+# Least share of the squared deviation (mbar) that differs from cycle to cycle, for a search for
+# rhythms. Chosen: a swinging supply has 0.3 to 0.8; leaks, vapour and ice up to 0.06.
 DIFFERS = 0.1
 # Groups of coefficients with the same meaning for a plant: inflows, and resistances of the line.
 ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
@@ -65,7 +65,7 @@ ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
 
 @dataclass(frozen=True)
 class Explained:
-    """A mechanism that explains what no listed effect does, with the causes beside it."""
+    """A mechanism that explains the deviation better than listed effects, and causes beside it."""
 
     fitted: Fitted  # the causes beside it, then the mechanism
     ends: tuple[Floats, Floats]  # low and high ends of the 95 % interval of each size
@@ -78,7 +78,7 @@ class Explained:
 
     @property
     def beside(self) -> Hypothesis:
-        """The listed causes that act as well."""
+        """The listed causes that act beside the mechanism."""
         return self.fitted.hypothesis[:-1]
 
 
@@ -113,7 +113,7 @@ def explain_alone(
 
 
 def is_a_course_of(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
-    """Whether a mechanism is a listed cause with another course in time.
+    """Whether a mechanism is a listed cause that acts at other times.
 
     It then acts at all times, on coefficients that the cause acts on. Those of a group of ALIKE
     count as the same.
@@ -133,10 +133,10 @@ def is_a_course_of(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
 def _displaces(
     evidence: Evidence, fitted: Sequence[int], single: Explained, causes: Hypothesis
 ) -> bool:
-    """Whether a mechanism leaves so much less than the causes that they only mimic it.
+    """Whether a mechanism's residual is so much smaller that the causes only mimic it.
 
-    Compared in mbar; if the causes leave no more mbar than healthy cycles have, also in likelihood.
-    One mechanism replaces several causes as well if it leaves less and is likelier.
+    Residuals are compared in mbar. If that of the causes is healthy, likelihoods are compared too.
+    One mechanism also replaces several causes if its residual is smaller and it is likelier.
     """
     weights, mechanism = covariance(evidence, both_ways=False).of(fitted), single.fitted.hypothesis
     before, after = _squares(evidence, weights, causes, mechanism)
@@ -323,9 +323,9 @@ def _rhythms(
     causes: Hypothesis,
     mechanism: Mechanism,
 ) -> list[_Start]:
-    """Starts of a swinging mechanism at the highest peaks of the periodogram of the residuals.
+    """Starts of a periodic mechanism at the highest peaks of the residuals' periodogram.
 
-    Sines and cosines are compared as the pressure answers to them, so cycles may interrupt them.
+    It fits the simulated responses to sines and cosines, so cycles may interrupt the rhythm.
     """
     (size,), (period, _) = mechanism.place.parameters, mechanism.when.parameters
     duration = float(evidence.seconds[-1] - evidence.seconds[0])
@@ -355,7 +355,7 @@ def _rhythms(
 def _explained(
     evidence: Evidence, fitted: Sequence[int], causes: Hypothesis, ranked: Sequence[Fitted]
 ) -> Explained | None:
-    """The best mechanism beside some causes; None if it leaves too much of what they leave."""
+    """The best mechanism beside some causes; None if it leaves too much of their residual."""
     best = ranked[0]
     best_covariance = covariance(evidence, best.hypothesis)
     weights = best_covariance.of(fitted)
@@ -374,7 +374,7 @@ def _explained(
 def _not_told_from(
     evidence: Evidence, weights: Weights, ranked: Sequence[Fitted]
 ) -> Iterator[Fitted]:
-    """Fits that are about as good as the best, or nearly the same in mbar.
+    """Fits that are about as likely as the best one, or nearly equal to it in mbar.
 
     A fit that differs from the best by far less than the healthy deviation may be the true one:
     the twin's own error decides the order of both.
@@ -394,8 +394,8 @@ def _left_in_mbar(
 ) -> float:
     """Mean square deviation of a hypothesis over that of causes, both less that of healthy cycles.
 
-    If the causes leave no more than healthy cycles have, millibars cannot show how much better it
-    is, as steep edges outweigh the rest: 0 if it leaves less than they do, else 1.
+    If the residual of the causes is healthy, the ratio is undefined, since steep edges dominate it:
+    then 0 if the hypothesis leaves less than they do, else 1.
     """
     before, after = _squares(evidence, weights, causes, hypothesis)
     usual = weights.usual**2

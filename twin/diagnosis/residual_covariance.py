@@ -1,7 +1,7 @@
 """Covariance of residuals: noise, cycle-to-cycle scatter and the model's own error.
 
 Scatter differs from cycle to cycle and averages out. The model's error is the same in all cycles
-and does not. A share of what a hypothesis explains counts as its error as well.
+and does not average out. A share of the deviation that a hypothesis explains counts as error too.
 """
 
 import math
@@ -39,35 +39,35 @@ from twin.signals import MS, Phase
 # linear in them.
 _OPENS = {name: p.touches[0] for name, p in SCATTERING.items() if p.is_time}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
-ROW = math.sqrt(3.0)  # half a row, over the sigma of a time that is anywhere within a row
+ROW = math.sqrt(3.0)  # half a row over the sigma of a time that is uniform within a row
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
-KNEE_WINDOWS = 10  # a knee's time has a sigma of a tenth of its window
-# Columns of ``moved``: for the knees, which are independent in a cycle, and for contact.
+KNEE_WINDOWS = 10  # the detector's window over the sigma of a breakpoint's time
+# Columns of ``moved``: breakpoints are independent within a cycle; one column is for contact.
 _TIMES = len(_OPENS) + len(_CLOSES) + 2
 KNEES = [len(SCATTERING) + len(_CLOSES) + _TIMES * order for order in (0, 1)]
 MEETS = KNEES[0] + 1
-# Sigmas in a bin: calibration cannot have seen a larger uncertainty of the data set. It cannot have
-# seen any of what another weather leaves open.
+# Sigmas in a bin: largest uncertainty of the data set that healthy cycles can hide. The
+# uncertainty by another weather never shows in them.
 UNSEEN = 3.0
-_INTO = (Phase.HOLD, Phase.SUCTION)  # phase that begins at each of LEVELS
+_INTO = (Phase.HOLD, Phase.SUCTION)  # the phase after each of LEVELS
 LEVEL_MBAR = 0.5  # sigma of a switching level, common to all cycles
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Whitens the residuals of some cycles: sigma 1, and independent."""
+    """Whitens the residuals of some cycles to independent values with sigma 1."""
 
-    cycles: tuple[int, ...]  # positions
-    bins: Ints  # of these cycles
-    covariance: parts.CoupledCovariance  # of bins, then levels
-    usual: float  # rms (mbar) over rows of a model that is as good as in healthy cycles
-    unmeasured: float  # rms (mbar) of uncertainty that no healthy cycle can have shown
-    sigma: Floats  # of each level
-    level_cycles: Ints  # of each level, positions
+    cycles: tuple[int, ...]  # positions of the cycles
+    bins: Ints  # bins of these cycles
+    covariance: parts.CoupledCovariance  # covariance of bins, then levels
+    usual: float  # rms (mbar) over rows of the residuals expected for a correct hypothesis
+    unmeasured: float  # rms (mbar) of the uncertainty that healthy cycles cannot show
+    sigma: Floats  # sigma of each level
+    level_cycles: Ints  # position of the cycle of each level
 
     @property
     def volume(self) -> float:
-        """Log-determinant of the covariance: a likelihood's penalty for wide weights."""
+        """Log-determinant of the covariance, as it stands in a log-likelihood."""
         return self.covariance.log_pdet
 
     def white(self, off: Floats, levels: Floats | None = None) -> Floats:
@@ -81,21 +81,21 @@ class Covariance:
     """Covariance of the bins of the judged cycles about a hypothesis (mbar)."""
 
     evidence: Evidence
-    mismatch: Floats  # by one sigma of the error in what causes explain, in each bin
-    moves: Floats  # by one sigma of each scatter, (bins, scatters)
-    left_open: Floats  # by one sigma of what calibration left open, as healthy cycles show it
-    beyond: Floats  # by the same, what they do not show; to first order, then to second
-    another_day: Floats  # by one sigma of what the log's day leaves open
-    day_mismatch: Floats  # by one sigma of the error in what the day explains
-    of_weather: bool = False  # whether that day has another weather
+    mismatch: Floats  # by one sigma of the error of the explained deviation, in each bin
+    moves: Floats  # by one sigma of each scattering quantity, (bins, quantities)
+    left_open: Floats  # by one sigma of each data-set uncertainty, as far as healthy cycles show it
+    beyond: Floats  # the rest of these responses: first order, then second order
+    another_day: Floats  # by one sigma of each uncertainty of the log's day
+    day_mismatch: Floats  # by one sigma of the error of the deviation that the day explains
+    of_weather: bool = False  # whether the log's day has another weather
 
     def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
-        """Weights of some cycles; not ``scattered``: without the scatter of effects."""
+        """Weights of some cycles; with ``scattered`` False, effects do not scatter."""
         evidence, bins = self.evidence, self.evidence.bins
         rows = np.flatnonzero(np.isin(bins.cycle, cycles))
         common, alone = model_error(evidence.healthy.error, bins.kind[rows], bins.time[rows])
         scatter = self.moves[rows] * float(scattered)
-        # Healthy cycles have shown how wide this is, but for what is new in this log.
+        # The factor holds for uncertainty that healthy cycles show, not for new causes in a log.
         learned = evidence.healthy.leftover
         unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
         unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
@@ -127,7 +127,7 @@ class Covariance:
         return Weights(tuple(cycles), rows, factored, usual, unmeasured, sigma, shown)
 
     def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats, leftover: float) -> Floats:
-        """Covariance (mbar²) between bins of a cycle of what differs from cycle to cycle."""
+        """Covariance (mbar²) between bins of a cycle by differences from cycle to cycle."""
         bins, healthy = self.evidence.bins, self.evidence.healthy
         reading = Reading(self.evidence.noise, healthy.rounding_mbar)
         knees = parts.low_rank(scatter[:, KNEES], bins.stretch[rows])
@@ -145,10 +145,10 @@ def _runs(number: Ints) -> list[slice]:
 def _in_common(
     bins: Bins, rows: Ints, errors: Sequence[Floats], unsure: Floats
 ) -> tuple[Floats, Floats]:
-    """Changes of bins (mbar) by what all cycles have in common, and the covariance of that.
+    """Responses of bins (mbar) to errors common to all cycles, and the covariance of these errors.
 
-    It is each of the model's ``errors`` at each time since a stretch began, by one sigma, and what
-    is ``unsure`` of the data set.
+    Common errors are those of the model (``errors``, one sigma) at each time since a stretch began,
+    and the responses ``unsure`` to uncertainties of the data set.
     """
     _, first, place = np.unique(
         (bins.kind[rows] << 32) + bins.since[rows], return_index=True, return_inverse=True
@@ -162,7 +162,7 @@ def _in_common(
 
 
 def _row_rms(variance: Floats, count: Ints, noise: float) -> float:
-    """The rms (mbar) over rows, from the variance of bins' means, which have less noise."""
+    """Rms (mbar) over rows by the variance of bins' means, whose noise is smaller."""
     rows = variance + noise**2 * (1.0 - 1.0 / count)
     return float(np.sqrt(np.average(rows, weights=count))) if len(count) else 0.0
 
@@ -200,11 +200,12 @@ def covariance(
 def opened_by_calibration(
     evidence: Evidence, opened: Floats, *, both_ways: bool = True
 ) -> tuple[Floats, Floats]:
-    """What calibration left open, as healthy cycles show it and beyond; from whole sigmas.
+    """Responses to the data set's uncertainties: the part that healthy cycles show, and the rest.
 
-    Only the calibration's record ties some values to each other. A whole sigma of them at once
-    does not quite suit it, as the model bends. So the twin without causes varies as it does nearby,
-    and what a whole sigma does to it is taken off.
+    ``opened`` are responses (mbar) to whole sigmas. The uncertainties are correlated by the
+    calibration's record. The model is nonlinear, so a whole sigma would contradict that record.
+    Hence the twin without causes varies by its linear response, and its response to a whole sigma
+    is subtracted.
     """
     tied = np.array([shift.tied for shift in evidence.uncertain], bool)
     nearby, up, down = evidence.left_open
@@ -213,7 +214,7 @@ def opened_by_calibration(
 
 
 def explained_by_day(residual_covariance: Covariance, off: Floats) -> Floats:
-    """What the log's day probably explains of what is ``off`` (mbar), in each bin."""
+    """Expected part (mbar) of the residual ``off`` that the log's day explains, in each bin."""
     days, evidence = residual_covariance.another_day, residual_covariance.evidence
     weights = replace(residual_covariance, another_day=days[:, :0]).of(evidence.judged)
     white = weights.white(np.column_stack([off, days]))
@@ -223,7 +224,7 @@ def explained_by_day(residual_covariance: Covariance, off: Floats) -> Floats:
 
 
 def _farthest_ambient(evidence: Evidence, about: Hypothesis) -> float:
-    """Ambient pressure (Pa) under a hypothesis, where it is farthest from the calibration's."""
+    """Ambient pressure (Pa) under a hypothesis at its largest distance from the calibration's."""
     calibrated = float(evidence.calibrated[c.AMBIENT])
     if not evidence.another_day:
         return calibrated
@@ -249,8 +250,8 @@ def moved(
     """Deviation of a hypothesis (mbar), and its changes by scatter and by uncertainty, (bins, ·).
 
     Changes by scatter are in this order: each effect in ``sizes``; one sigma of the times at which
-    valves close, of the knees, and of contact with the part; the second order of such times. A
-    time is varied by half a row where that is more: the response of an edge bends within it.
+    valves close, of the breakpoints, and of contact with the part; the second order of such times.
+    A time is varied by at least half a row, since the response of an edge is nonlinear within it.
     Changes by uncertainty are those of the ``uncertain`` data sets, first and second order. Without
     ``both_ways`` only the first of each pair counts.
     """
@@ -293,7 +294,7 @@ def moved(
 
 
 def _at_another_time(theta: Theta, coefficient: int, later_ms: float) -> Theta:
-    """Coefficients with one time later."""
+    """Coefficients with one time later by ``later_ms``."""
     moved = theta.copy()
     moved[coefficient] += later_ms * MS
     if coefficient == c.CONTACT:
@@ -302,7 +303,7 @@ def _at_another_time(theta: Theta, coefficient: int, later_ms: float) -> Theta:
 
 
 def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
-    """Scattering effects: effect to parameter and one sigma."""
+    """Parameter and sigma of each scattering effect."""
     learned = evidence.healthy.scatter
     sizes = {}
     for name, p in SCATTERING.items():
@@ -338,7 +339,7 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
 
 
 def _nodes(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Ints:
-    """Rows at which the switching of a hypothesis is simulated, to interpolate it ``at`` others.
+    """Rows at which the switching of a hypothesis is simulated; rows ``at`` are interpolated.
 
     A ramp needs its middle and its ends.
     """
@@ -355,7 +356,7 @@ def _nodes(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Ints:
 
 
 def _shown(evidence: Evidence, cycles: Sequence[int]) -> list[tuple[int, int]]:
-    """Cycle and index into LEVELS of each level that was measured."""
+    """Cycle and index into LEVELS of each measured level."""
     return [
         (cycle, number)
         for cycle in cycles

@@ -26,16 +26,21 @@ SHORTEST_CYCLE_S = 1.0  # cycle time for which false alarms are budgeted; longer
 class FigureSettings(DatabaseSettings):
     """What is permitted in a cycle, the field's defaults; and whether figures are kept."""
 
-    permitted_t1_ms: Positive | None = None  # as the data set expects it, and the tolerance
-    permitted_leakage_mbar_s: Positive | None = None  # the same; at least what the ejector permits
+    # Longest t1; by default the data set's, with the tolerance.
+    permitted_t1_ms: Positive | None = None
+    # Largest leakage; by default the data set's with the tolerance, at least what the ejector
+    # permits.
+    permitted_leakage_mbar_s: Positive | None = None
     permitted_free_flow_mbar: Positive | None = None  # where the ejector would report a part
     supply_low_bar: Annotated[float, Field(ge=0.0)] | None = None  # gauge, at the nozzle
     supply_high_bar: Positive | None = None  # both as the data set has it, and the tolerance
     energy_kwh_m3: Positive = 0.12  # to compress a standard cubic metre, whole compressor station
-    price_per_kwh: Positive | None = None  # of electric energy, in the currency; or price_per_m3
-    price_per_m3: Positive | None = None  # of compressed air, each 1000 Nl (ISO 8778); or the other
-    currency: Annotated[str, Field(min_length=1, max_length=8)] = "€"  # as it is written
-    # In a year, for costs a year: chosen, two shifts of 8 h on 250 days; a year has 8760.
+    # Price of electric energy in the currency; or set price_per_m3.
+    price_per_kwh: Positive | None = None
+    # Price of 1000 Nl of compressed air (ISO 8778); or set price_per_kwh.
+    price_per_m3: Positive | None = None
+    currency: Annotated[str, Field(min_length=1, max_length=8)] = "€"  # symbol of the currency
+    # Hours a year for yearly costs. Chosen: two shifts of 8 h on 250 days; a year has 8760.
     operating_hours: Annotated[float, Field(gt=0.0, le=8784.0)] = 4000.0
     autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
     keep: bool = False  # twin run adds its cycles to the database

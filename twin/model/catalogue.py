@@ -43,7 +43,7 @@ class CatalogueEffect(Settings):
     mechanism: str  # what acts where and when; docs/mechanisms.md lists them
     sentence: Words  # what it is, as answers say it
     look_at: Words = "what was found where it was seen first"  # what to look at first
-    parameters: Mapping[str, Range]  # of the mechanism: its sizes, and what shapes it
+    parameters: Mapping[str, Range]  # sizes of the mechanism, and the parameters that shape it
     found_in: Mapping[str, str] = Field(default_factory=dict)  # unit, log, data set, program
 
     @model_validator(mode="after")

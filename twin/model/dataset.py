@@ -1,4 +1,4 @@
-"""The data set of an ejector and what hangs on it, in the field's units, and its SI form.
+"""The data set of an ejector and its evacuated system, in the field's units, and its SI form.
 
 An object-specific data set describes a type, an instance-specific one a single unit; both have this
 shape. ``coefficients`` converts it into the vector of the compiled kernel: the only place where the
@@ -28,11 +28,11 @@ from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
-LEAST_SHARE = 1e-3  # of suction at its optimum supply, as in the plant
-AFTER_BLOW_OFF = -5e5  # Pa of vacuum, which no blow-off reaches: the part goes when it ends
-SHORTEST_SWING = 5e-3  # s, shortest period of a line that samples at 1 kHz show
-UNSEEN_SWING = 3.5e-3  # s, longest period of a line that they do not show at all
-RIPPLE = 1e-3  # of suction capacity: permitted fall from one hundredth of the range to the next
+LEAST_SHARE = 1e-3  # least suction over that at its optimum supply, as in the plant
+AFTER_BLOW_OFF = -5e5  # Pa of vacuum, which no blow-off reaches: the part leaves as it ends
+SHORTEST_SWING = 5e-3  # s, shortest period of a line that rows at 1 kHz show in full
+UNSEEN_SWING = 3.5e-3  # s, longest period of a line that rows at 1 kHz do not show at all
+RIPPLE = 1e-3  # permitted fall of suction per hundredth of the range, over suction capacity
 
 # Codes of the configured modes in the coefficients.
 AIR_SAVING_MODES = {
@@ -50,25 +50,25 @@ CONTROL_SENSORS = {"own": c.OWN, "plc": c.PLC}
 
 
 class Ambient(Settings):
-    """The air around."""
+    """The air around the ejector."""
 
-    pressure_mbar: float = Field(1013.0, ge=500.0, le=1100.0)  # absolute
-    temperature_c: float = Field(20.0, ge=-20.0, le=60.0)  # of air and walls
+    pressure_mbar: float = Field(1013.0, ge=500.0, le=1100.0)  # absolute ambient pressure
+    temperature_c: float = Field(20.0, ge=-20.0, le=60.0)  # temperature of air and walls
 
 
 class Supply(Settings):
     """Operating pressure, and how suction and end pressure follow it."""
 
-    pressure_bar: float = Field(4.5, gt=0.0, le=10.0)  # gauge, at the regulator
-    droop_bar: NotNegative = 0.0  # less at the nozzle while a valve is open
-    lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # of the supply line
-    # At which suction is greatest: an ejector is made for the pressure that it is run at.
+    pressure_bar: float = Field(4.5, gt=0.0, le=10.0)  # gauge pressure at the regulator
+    droop_bar: NotNegative = 0.0  # pressure drop at the nozzle while a valve is open
+    lag_ms: float = Field(20.0, ge=1.0, le=1000.0)  # time constant of the supply line
+    # Gauge pressure of the greatest suction, by default pressure_bar.
     optimum_bar: float = Field(
         default_factory=lambda values: values["pressure_bar"], gt=0.0, le=10.0
     )
     # Suction over its greatest is 1 − curvature · (supply / optimum − 1)².
     curvature: NotNegative = 1.0
-    end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar missing
+    end_pressure_slope: NotNegative = 0.2  # relative rise of end pressure per bar of missing supply
 
     @property
     def nozzle_bar(self) -> float:
@@ -83,7 +83,7 @@ class Supply(Settings):
 
 
 def closing_stage(x: npt.NDArray[np.float64], at: float) -> npt.NDArray[np.float64]:
-    """Suction of a stage that closes at ``at``, relative to ambient; the same as in the kernel."""
+    """Suction of a stage that closes at ``at`` over that at ambient, as in the kernel."""
     open_by, end, most = (
         np.hypot(distance, c.KINK_WIDTH) + distance for distance in (x - at, -at, 1.0 - at)
     )
@@ -94,65 +94,79 @@ def closing_stage(x: npt.NDArray[np.float64], at: float) -> npt.NDArray[np.float
 class Ejector(Settings):
     """Characteristic, timing, blow-off and control of the ejector."""
 
-    suction_capacity_sl_min: Positive = 33.4  # at ambient and optimum supply
-    end_pressure_mbar: Positive = 150.0  # absolute, at optimum supply: no flow is left
-    # Of the characteristic over the straight line; 0 is straight.
+    suction_capacity_sl_min: Positive = 33.4  # suction at ambient pressure and optimum supply
+    end_pressure_mbar: Positive = 150.0  # absolute pressure without flow, at optimum supply
+    # Relative bulge of the characteristic above a straight line; 0 is straight.
     bulge: float = Field(0.0, ge=-1.0, le=4.0)
-    skew: float = Field(0.0, ge=-20.0, le=20.0)  # the same, more near ambient
-    bend_2: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of second order
-    bend_3: float = Field(0.0, ge=-40.0, le=40.0)  # the same, of third order
-    kink: float = Field(
-        0.0, ge=0.0, le=0.95
-    )  # share of the suction at ambient that a second stage has
-    # Where that stage closes, of the way from end pressure to ambient.
+    # Linear change of the bulge from end pressure to ambient.
+    skew: float = Field(0.0, ge=-20.0, le=20.0)
+    bend_2: float = Field(0.0, ge=-40.0, le=40.0)  # quadratic change of the bulge
+    bend_3: float = Field(0.0, ge=-40.0, le=40.0)  # cubic change of the bulge
+    # Share of a second stage in the suction at ambient.
+    kink: float = Field(0.0, ge=0.0, le=0.95)
+    # Where the second stage closes: 0 at end pressure, 1 at ambient.
     kink_at: float = Field(0.4, ge=0.02, le=0.95)
-    port_volume_ml: Positive = 1.0  # inside the ejector, before the hose
-    air_consumption_sl_min: NotNegative = 80.0  # of the nozzle, at operating pressure
-    response_ms: float = Field(15.0, ge=0.0, le=500.0)  # from the command to the valve's action
-    # From the end of the command to the valve's action.
+    port_volume_ml: Positive = 1.0  # volume inside the ejector, before the hose
+    # Air consumption of the nozzle at operating pressure.
+    air_consumption_sl_min: NotNegative = 80.0
+    # Delay from the command to the suction valve's action.
+    response_ms: float = Field(15.0, ge=0.0, le=500.0)
+    # Delay from the end of the command to the suction valve's action.
     response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
-    ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)  # of the jet, in two equal stages
-    jet_full_at: float = Field(
-        1.0, ge=0.02, le=1.0
-    )  # share of a slow valve's opening at which the jet is full
-    ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)  # of the jet as it ends, in two equal stages
-    jet_depth: float = Field(1.0, ge=0.0, le=1.0)  # how much less deep a weaker jet draws
-    blow_off_sl_min: NotNegative = 100.0  # into ambient pressure
-    blow_off_shape: float = Field(0.0, ge=-0.9, le=3.0)  # how much more flows into full vacuum
-    # Rate at which it drains a reservoir of its own; 0: it comes from the supply.
+    # Time constant of both stages of the growing jet.
+    ramp_up_ms: float = Field(8.0, ge=0.5, le=500.0)
+    # Opening of a slow valve from which the jet is full, as a share.
+    jet_full_at: float = Field(1.0, ge=0.02, le=1.0)
+    # Time constant of both stages of the decaying jet.
+    ramp_down_ms: float = Field(4.0, ge=0.5, le=500.0)
+    # Dependence of end vacuum on the jet's strength; 0: none.
+    jet_depth: float = Field(1.0, ge=0.0, le=1.0)
+    blow_off_sl_min: NotNegative = 100.0  # blow-off flow into ambient pressure
+    # Relative increase of the blow-off flow into full vacuum.
+    blow_off_shape: float = Field(0.0, ge=-0.9, le=3.0)
+    # Rate at which blow-off drains a reservoir; 0: the supply feeds it.
     blow_off_drain_per_s: NotNegative = 0.0
-    blow_off_refill: NotNegative = 0.3  # rate at which that fills again, over that
-    # From the command to the valve's action.
+    blow_off_refill: NotNegative = 0.3  # refill rate of that reservoir over its drain rate
+    # Delay from the command to the blow-off valve's action.
     blow_off_response_ms: float = Field(15.0, ge=0.0, le=500.0)
-    # From the end of the command to the valve's action.
+    # Delay from the command's end to the blow-off valve's action.
     blow_off_response_off_ms: float = Field(12.0, ge=0.0, le=500.0)
-    blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)  # time constant of the flow
-    blow_off_closing_factor: float = Field(1.0, ge=0.02, le=50.0)  # of its end, over that
-    exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)  # a loss of suction narrows it as well
-    filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)  # 1: the sensor is behind its filter
-    end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)  # times as end_pressure_slope has it
-    relief_sl_min: NotNegative = 200.0  # out 100 mbar above the pressure where the relief opens
-    exhaust_sl_min: NotNegative = 0.0  # out through the exhaust, sonic, where it is an opening
-    cracking_pressure_mbar: NotNegative = 0.0  # above ambient, where the check valve lets out
-    # Above ambient, where the relief opens: with the check valve, or a valve of its own.
+    # Time constant of the growing blow-off flow.
+    blow_off_ramp_ms: float = Field(5.0, ge=0.5, le=500.0)
+    # Time constant of the ending blow-off flow over the growing one's.
+    blow_off_closing_factor: float = Field(1.0, ge=0.02, le=50.0)
+    # Narrowing of the exhaust over a loss of suction, both as shares.
+    exhaust_follows: float = Field(0.0, ge=0.0, le=1.0)
+    # 1: the filter is between ejector and sensor; 0: behind the sensor.
+    filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)
+    # Factor on end_pressure_slope for a supply below nominal.
+    end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)
+    relief_sl_min: NotNegative = 200.0  # relief flow at 100 mbar above the relief pressure
+    exhaust_sl_min: NotNegative = 0.0  # sonic flow through an exhaust that is an opening
+    # Port pressure above ambient that opens the check valve.
+    cracking_pressure_mbar: NotNegative = 0.0
+    # Port pressure above ambient that opens the relief, by default the check valve's.
     relief_pressure_mbar: NotNegative = Field(
         default_factory=lambda values: values["cracking_pressure_mbar"]
     )
-    back_flow_sl_min: NotNegative = 0.0  # in through it while off, sonic; no check valve
+    # Sonic flow into the port without a check valve, with the nozzle off.
+    back_flow_sl_min: NotNegative = 0.0
     # Vacuum at which air saving switches the nozzle off.
     h1_mbar: float = Field(750.0, gt=0.0, le=998.0)
-    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)  # below H1, at which it is on again
-    # 1: the ejector's own sensor counts from zero, so H1 moves with ambient pressure.
+    # Air saving switches the nozzle on this far below H1.
+    h1_hysteresis_mbar: float = Field(150.0, gt=0.0)
+    # 1: H1 moves with ambient pressure, since the ejector's own sensor is absolute.
     h1_follows_ambient: float = Field(0.0, ge=0.0, le=1.0)
     h2_mbar: float = Field(550.0, gt=0.0, le=998.0)  # vacuum at which the part is present
-    h2_hysteresis_mbar: float = Field(10.0, gt=0.0)  # below H2, at which the part is gone
-    # As it is set at the ejector.
+    h2_hysteresis_mbar: float = Field(10.0, gt=0.0)  # the part counts as gone this far below H2
+    # Air-saving mode set at the ejector.
     air_saving: Literal["off", "on", "leak_monitoring", "without_continuous"] = "on"
-    permitted_leakage_mbar_s: Positive = 250.0  # above it leak_monitoring keeps the nozzle on
-    # By the command; a pulse after suction; or a pulse started from outside.
+    # Leakage above which leak_monitoring keeps the nozzle on.
+    permitted_leakage_mbar_s: Positive = 250.0
+    # Start of blow-off: by the command, or a pulse after suction or from outside.
     blow_off: Literal["external", "internal", "timed"] = "external"
-    blow_off_time_ms: float = Field(200.0, ge=100.0, le=9990.0)  # of a pulse
-    control_sensor: Literal["own", "plc"] = "own"  # whose pressure H1 and H2 are compared with
+    blow_off_time_ms: float = Field(200.0, ge=100.0, le=9990.0)  # duration of a blow-off pulse
+    control_sensor: Literal["own", "plc"] = "own"  # sensor that is compared with H1 and H2
 
     def share(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Suction over suction capacity; ``x`` runs from 0 at end pressure to 1 at ambient."""
@@ -173,7 +187,7 @@ class Ejector(Settings):
 
     @model_validator(mode="after")
     def _characteristic_falls(self) -> "Ejector":
-        """Less suction at more vacuum, as any ejector: the slope over x stays positive."""
+        """Suction falls with vacuum, as with any ejector: the slope over x stays positive."""
         x = np.linspace(0.0, 1.0, 101)
         steps = np.diff(self.share(x))
         if (steps < -RIPPLE).any():
@@ -186,18 +200,20 @@ class Ejector(Settings):
 
 
 class Wiring(Settings):
-    """The pressure sensor the PLC reads, as a signal."""
+    """The signal of the pressure sensor that the PLC reads."""
 
-    lag_ms: float = Field(3.0, ge=0.5, le=500.0)  # of sensor and input, in two equal stages
-    noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, steps included
-    sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # from row to row
-    renewed_ms: float = Field(0.0, ge=0.0, le=100.0)  # from reading to reading; 0: as rows come
-    reference: Literal["absolute", "gauge"] = "absolute"  # what it counts from: zero, or ambient
+    lag_ms: float = Field(3.0, ge=0.5, le=500.0)  # time constant of both stages of sensor and input
+    noise_mbar: float = Field(0.4, gt=0.0, le=50.0)  # one standard deviation, with quantisation
+    sampling_ms: float = Field(1.0, ge=0.5, le=100.0)  # time from row to row
+    # Time from one new reading to the next; 0: each row has one.
+    renewed_ms: float = Field(0.0, ge=0.0, le=100.0)
+    # Zero of the sensor: absolute zero, or ambient pressure.
+    reference: Literal["absolute", "gauge"] = "absolute"
 
     def noise_in_means(self, sampling_ms: float | None = None) -> float:
-        """One sigma (mbar) of a row's noise as it counts in means over rows.
+        """Sigma (mbar) of independent rows with the same noise in means over rows.
 
-        Rows that repeat a reading say nothing new: in means each has √n times the noise.
+        Repeated readings add no information: √n times the noise each for n equal rows.
         """
         repeated = self.renewed_ms / (sampling_ms or self.sampling_ms)
         return self.noise_mbar * math.sqrt(max(repeated, 1.0))
@@ -206,38 +222,46 @@ class Wiring(Settings):
 class System(Settings):
     """What the ejector evacuates: its parts outwards from the port, and how they are joined."""
 
-    # Outwards from the ejector, each of its kind.
+    # Parts in order from the ejector outwards.
     parts: tuple[Part, ...] = (
         Tube(kind="tube", length_mm=100.0, diameter_mm=6.0),
         Vessel(kind="vessel", volume_ml=750.0),
     )
-    # Their true volume is within this factor, with 95 %; flows and volumes found are as exact.
+    # Accuracy factor (95 %) of the volumes; flows are as accurate.
     volumes_within_factor: float = Field(1.06, ge=1.0, le=100.0)
-    film_coefficient: NotNegative = 10.0  # W/(m² K), of vessel and cups
-    free_convection: float = Field(
-        0.0, ge=0.0, le=1.0
-    )  # share of that at 10 K between gas and wall
-    forced_convection: NotNegative = 0.0  # how many times more while all blow-off enters
+    film_coefficient: NotNegative = 10.0  # W/(m² K), vessel and cups
+    # Share of free convection in film_coefficient at 10 K between gas and wall.
+    free_convection: float = Field(0.0, ge=0.0, le=1.0)
+    # Relative increase of film_coefficient at the full blow-off flow.
+    forced_convection: NotNegative = 0.0
     tube_film_coefficient: NotNegative = 60.0  # W/(m² K)
-    line_factor: NotNegative = 1.0  # flow resistance over what the parts add up to
-    line_volume_factor: Positive = 1.0  # the tubes' volume over what the parts add up to
-    line_inertia_factor: NotNegative = 1.0  # inertia of their gas over the same
-    line_share: float = Field(0.6, gt=0.0, lt=1.0)  # of the tubes' volume, half-way along
-    sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)  # of its place: 1 is the whole line outwards
-    rim: Literal["laminar", "turbulent"] = "laminar"  # of a cup that stands open
-    opening_factor: NotNegative = 1.0  # what flows through open cups over what they say
-    shrinks_ml: NotNegative = 0.0  # at full vacuum, beside what the cups say
-    softness: NotNegative = 0.0  # 0: shrinks in proportion to vacuum, n: half by 1/(n + 2) of it
-    stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly give way
-    creep_share: float = Field(0.0, ge=0.0, le=1.0)  # of what they shrink by, that comes later
-    creep_ms: Positive = 50.0  # time constant of that
-    leak_sl_min: NotNegative = 0.3  # of seals and fittings, sonic
-    leak_critical_ratio: float = Field(CRITICAL_RATIO, ge=0.1, le=0.6)  # up to which it is
+    line_factor: NotNegative = 1.0  # flow resistance of the line over that of its parts
+    line_volume_factor: Positive = 1.0  # volume of the tubes over that of their dimensions
+    # Inertia of the tubes' gas over that of their dimensions.
+    line_inertia_factor: NotNegative = 1.0
+    # Share of the tubes' volume in the node half-way along.
+    line_share: float = Field(0.6, gt=0.0, lt=1.0)
+    # Shift of the sensor as a share of the line, positive away from the ejector.
+    sensor_shift: float = Field(0.0, ge=-1.0, le=1.0)
+    rim: Literal["laminar", "turbulent"] = "laminar"  # flow through the rim of an open cup
+    opening_factor: NotNegative = 1.0  # flow through open cups over that of their data
+    shrinks_ml: NotNegative = 0.0  # shrinkage at full vacuum in addition to that of the cups
+    # 0: shrinkage in proportion to vacuum; n: half of it by 1/(n + 2) of full vacuum.
+    softness: NotNegative = 0.0
+    stiff_mbar: NotNegative = 0.0  # vacuum up to which cups hardly shrink
+    # Share of the shrinkage that comes later, by creep.
+    creep_share: float = Field(0.0, ge=0.0, le=1.0)
+    creep_ms: Positive = 50.0  # time constant of creep
+    leak_sl_min: NotNegative = 0.3  # sonic flow of leaks at seals and fittings
+    # Largest pressure ratio at which the leaks are sonic.
+    leak_critical_ratio: float = Field(CRITICAL_RATIO, ge=0.1, le=0.6)
+    # When a part leaves: at the release_mbar of its cup, or when blow-off ends.
     part_leaves: Literal["in_blow_off", "after_blow_off"] = (
         "in_blow_off"  # when a cup's part goes: at its release_mbar, or when blow-off ends
     )
-    release_shift_mbar: float = 0.0  # more vacuum than its cup's release_mbar, at which it goes
-    part_meets_ms: NotNegative = 0.0  # after suction is commanded: cups that move to the part
+    release_shift_mbar: float = 0.0  # difference of the release vacuum from the cup's release_mbar
+    # Time from the suction command until moving cups meet the part.
+    part_meets_ms: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _line_has_volume(self) -> "System":
@@ -263,10 +287,10 @@ class DataSet(Settings):
     ejector: Ejector = Ejector()
     sensor: Wiring = Wiring()
     system: System = System()
-    # What a diagnosis found beside all that: effects with their sizes, by name.
+    # Additional effects that a diagnosis found, with their sizes, by name.
     effects: Mapping[str, Mapping[str, float]] = Field(default_factory=dict)
-    terms: tuple[Term, ...] = ()  # the same: what data added where no effect is known
-    # Effects that were found before and taken in: the search has them beside its table, by name.
+    terms: tuple[Term, ...] = ()  # empirical terms that a diagnosis added where no effect is known
+    # Mechanisms that were stored as effects by name; a diagnosis searches them too.
     catalogue: Mapping[str, CatalogueEffect] = Field(default_factory=dict)
 
     @field_validator("catalogue")
@@ -324,7 +348,7 @@ class DataSet(Settings):
 
     @property
     def hash(self) -> str:
-        """Hash of the content: data sets with equal hashes give equal expected pressures."""
+        """Hash of the content; equal hashes mean equal expected pressures."""
         expects = self.model_dump_json(exclude={"catalogue"})
         return hashlib.sha256(expects.encode()).hexdigest()[:16]
 
@@ -435,7 +459,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
 
 
 def sensor_place(data: DataSet) -> float:
-    """Place of the sensor along the line: 0 at the port, 1 at the vessel."""
+    """Position of the sensor along the line: 0 at the port, 1 at the vessel."""
     theta = coefficients(data)
     line = float(theta[c.NEAR_RESISTANCE] + theta[c.RESISTANCE])
     return float(theta[c.PLACE]) / line if line > 0.0 else 0.0

@@ -72,7 +72,7 @@ class DenseSolver:
     """A model with its state from call to call; it starts by waiting for a synchronisation."""
 
     now: State = field(default_factory=_nowhere)  # at the newest row; only what is read is current
-    begin: State = field(default_factory=_nowhere)  # of the step under way
+    begin: State = field(default_factory=_nowhere)  # start of the present step
     end: State = field(default_factory=_nowhere)
     clock: Floats = field(default_factory=_clock)
 

@@ -1,7 +1,8 @@
 """Every way a real ejector can differ from its data set: one table, one entry each.
 
-Every effect is always compiled in; at neutral it changes nothing to the last bit. The monitor names
-them by their signatures, the diagnosis searches their parameters, an extended model sets them.
+Every effect is always compiled in; at its neutral value it changes no bit of the result. The
+monitor isolates effects by their signatures, the diagnosis searches their parameters, and an
+extended model sets them.
 """
 
 import math
@@ -13,20 +14,20 @@ from twin.model import theta as c
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, MS, SL_MIN
 
-FLATTEST = 0.9  # of the volume: cups that give way do not vanish
-# How often an effect comes, beside what wears: that is taken for once in two years.
+FLATTEST = 0.9  # largest share of the volume by which cups shrink
+# Frequency of an effect over that of wear, which is assumed to come once in two years.
 WEEKLY, SELDOM = 100.0, 0.1
-# Of an estimated size, one sigma beside what a log leaves open. A rig has other equations than the
-# model: 9 % rms over 11 sizes on rigs of the second world (tools/battery_second.py), less of what a
-# reading shows by itself.
+# Relative sigma of an estimated size in addition to that of the log. A rig has other equations than
+# the model: 9 % rms over 11 sizes on rigs of the second world (tools/battery_second.py), less for
+# sizes that a reading shows directly.
 OTHER_EQUATIONS, READ_OFF = 0.08, 0.03
-# Suction (kg/s) and volume (m³) of a unit for which typical sizes are meant: a small gripper.
+# Suction (kg/s) and volume (m³) of the unit that typical sizes refer to: a small gripper.
 USUAL_SUCTION, USUAL_VOLUME = 30.0 * SL_MIN, 150.0 * ML
 UNKNOWN = "unknown"  # stands for an effect where a deviation has no name yet
 
 
 def is_of_volumes(unit: str) -> bool:
-    """Whether a unit is that of a flow or a volume: pressures show only ratios of these."""
+    """Whether a unit is one of flow or volume; pressures show only the ratios of these."""
     return unit in ("sl/min", "ml")
 
 
@@ -34,9 +35,9 @@ def is_of_volumes(unit: str) -> bool:
 class Parameter:
     """One number of an effect, in the field's unit.
 
-    ``typical`` is a change worth an alarm; of a ``ratio`` it is a factor. Neutral is zero, or the
-    data set's own value where the parameter replaces a ``coefficient`` rather than adding to it;
-    of a ratio, which only says how an effect acts, it is the lowest value, or what is ``usual``.
+    ``typical`` is a change worth an alarm; for a ``ratio`` it is a factor. The neutral value is
+    zero, or the data set's value if the parameter replaces a ``coefficient``. A parameter that only
+    shapes an effect has its ``usual`` value, or the lowest one, instead.
     """
 
     name: str
@@ -44,16 +45,16 @@ class Parameter:
     low: float
     high: float
     typical: float
-    # Numbers of the coefficients that it changes, none for a mechanism, which acts on any. The
-    # first is the one that it stands for: of a valve's delay, when that opens.
+    # Numbers of the coefficients that it changes; none for a mechanism, which acts on any. The
+    # first is the main one: for a valve's delay, that of opening.
     touches: tuple[int, ...] = ()
     coefficient: int | None = None
-    ratio: bool = False  # what matters is how many times as large it is: a time constant
-    usual: float | None = None  # of what shapes an effect that was seen before
-    is_of_the_log: bool = False  # a phase: another log has another one
-    relative_error: float = OTHER_EQUATIONS  # of an estimated size, one sigma
-    # One sigma by which it differs from cycle to cycle in a healthy ejector, in its unit, until a
-    # better one is learned; 0: it does not.
+    ratio: bool = False  # scale is logarithmic, as for a time constant
+    usual: float | None = None  # usual value of a parameter that shapes an effect seen before
+    is_of_the_log: bool = False  # holds for one log only: a phase
+    relative_error: float = OTHER_EQUATIONS  # one sigma of an estimated size, relative
+    # Scatter (one sigma) from cycle to cycle in a healthy ejector, in its unit, until a better one
+    # is learned; 0: none.
     healthy_sigma: float = 0.0
 
     @property
@@ -68,11 +69,11 @@ class Parameter:
 
     @property
     def shapes(self) -> bool:
-        """Whether it says how an effect acts that was seen before, and not how much."""
+        """Whether it shapes an effect that was seen before, instead of giving its size."""
         return self.usual is not None
 
     def neutral(self, theta: Theta) -> float:
-        """Return the value at which the effect changes nothing, or what is usual."""
+        """The value at which the effect changes nothing; the usual value of a shaping parameter."""
         if self.usual is not None:
             return self.usual
         if self.ratio:
@@ -80,32 +81,32 @@ class Parameter:
         return 0.0 if self.coefficient is None else float(theta[self.coefficient])
 
     def steps_to(self, value: float, theta: Theta) -> float:
-        """How many typical changes lie between neutral and ``value``."""
+        """Number of typical changes from neutral to ``value``."""
         if self.ratio:
             return math.log(value / self.neutral(theta)) / math.log(self.typical)
         return (value - self.neutral(theta)) / self.typical
 
     def after(self, steps: float, theta: Theta) -> float:
-        """The value so many typical changes from neutral: the inverse of ``steps_to``."""
+        """The value at ``steps`` typical changes from neutral: the inverse of ``steps_to``."""
         if self.ratio:
             return float(self.neutral(theta) * self.typical**steps)
         return self.neutral(theta) + steps * self.typical
 
     def typical_on(self, theta: Theta) -> float:
-        """A change worth an alarm on a unit: of flows and volumes less if the unit is small."""
+        """A change worth an alarm on a unit; flows and volumes scale with the unit's size."""
         volume = theta[c.PORT_VOLUME] + theta[c.LINE_VOLUME] + theta[c.VOLUME]
         of_usual = {"sl/min": theta[c.SUCTION] / USUAL_SUCTION, "ml": volume / USUAL_VOLUME}
         return self.typical * min(float(of_usual.get(self.unit, 1.0)), 1.0)
 
     def range(self, theta: Theta) -> tuple[float, float]:
-        """Return the bounds of a change from neutral."""
+        """The bounds of a change from neutral."""
         neutral = self.neutral(theta)
         return self.low - neutral, self.high - neutral
 
     def reported(self, change: float, theta: Theta) -> float | None:
-        """Return an estimated change from neutral as it is told; None at or beyond a bound.
+        """An estimated change from neutral for people; None at or beyond a bound.
 
-        There the estimate has left what the effect can be. The bound itself would be no estimate.
+        At a bound the effect cannot explain the log: the bound itself is no estimate.
         """
         low, high = self.range(theta)
         return change if low < change < high else None
@@ -113,10 +114,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Law:
-    """How an effect acts where its size alone does not say it, and no healthy cycle shows it.
+    """A shape of an effect that differs from unit to unit and that no healthy cycle shows.
 
-    A data set's value for it, ``ejector.name``, is that of a type which is well known. A diagnosis
-    tries each of ``tried``: what only one of them tells from another cause is not told apart.
+    The data set's value, ``ejector.name``, holds for a well-known type. A diagnosis tries each
+    value in ``tried``. Causes that differ under only one of these values count as look-alikes.
     """
 
     name: str
@@ -126,11 +127,12 @@ class Law:
 
 @dataclass(frozen=True)
 class Effect:
-    """What differs, in words a maintenance person understands, and where it acts.
+    """One way in which an ejector differs, in words for maintenance, and where it acts.
 
-    ``sentence`` says what it is, ``look_at`` what to look at first, ``often`` how often it comes
-    beside what wears: weather is weekly, a sensor of steel and silicon hardly ever drifts.
-    ``can_be_mended`` is False for weather and set-up: live, their prior weight is small.
+    ``sentence`` describes it, ``look_at`` names the first thing to inspect, and ``often`` is its
+    frequency over that of wear: weather is weekly, a sensor of steel and silicon hardly ever
+    drifts. ``can_be_mended`` is False for weather and set-up: the live monitor gives them a small
+    prior weight.
     """
 
     name: str
@@ -139,7 +141,7 @@ class Effect:
     parameters: tuple[Parameter, ...]
     act: Callable[..., None]  # (theta, one value per parameter) -> changes theta in place
     often: float = 1.0
-    acts: Callable[[Theta], bool] = lambda _: True  # whether a unit has what it acts on
+    acts: Callable[[Theta], bool] = lambda _: True  # whether the effect can act on a unit
     law: Law | None = None
     can_be_mended: bool = True
 
@@ -150,18 +152,18 @@ class Effect:
 
     @property
     def is_weather(self) -> bool:
-        """Whether it is another ambient pressure.
+        """Whether the effect is another ambient pressure.
 
         Its typical size is one sigma of the weather, and a barometer shows it.
         """
         return c.AMBIENT in self.touches
 
     def laws(self) -> list[dict[str, float]]:
-        """The laws that it may act by, as values beside those of its parameters."""
+        """The possible laws, as values beside those of the parameters."""
         return [{self.law.name: value} for value in self.law.tried] if self.law else [{}]
 
     def frequency(self, *, ambient_is_measured: bool) -> float:
-        """Prior frequency, over that of wear; measured weather is followed, so hardly a cause."""
+        """Prior frequency over that of wear; small if the model follows the weather."""
         is_followed = ambient_is_measured and self.is_weather
         return min(self.often, 1.0) if is_followed else self.often
 
@@ -191,7 +193,7 @@ def _end_vacuum_loss(theta: Theta, rise: float) -> None:
 
 def _supply_pressure_drop(theta: Theta, drop: float) -> None:
     theta[c.SUPPLY] -= drop * BAR
-    rise = theta[c.END_SLOPE] * drop * BAR  # which the plant adds; what sags by itself was fitted
+    rise = theta[c.END_SLOPE] * drop * BAR  # the plant adds it; the supply's own droop was fitted
     theta[c.END_RATIO] *= (1.0 + theta[c.END_FOLLOWS] * rise) / (1.0 + rise)
 
 
@@ -382,7 +384,7 @@ _TABLE = (
         "the suction valve and the supply hose: something opens slowly",
         (_P("time_constant", "ms", 0.0, 400.0, 20.0, (c.SLOW_RAMP_UP,)),),
         _slow_ramp_up,
-        # The jet grows with the valve's opening, or is there long before it is open.
+        # The jet grows with the valve's opening, or is full long before the valve is open.
         law=Law("jet_full_at", c.JET_FULL_AT, (1.0, 0.5, 0.2, 0.08)),
     ),
     Effect(
@@ -400,7 +402,7 @@ _TABLE = (
         "weak_blow_off",
         "The blow-off flow is too small",
         "the blow-off valve and its throttle screw",
-        # A narrower valve on a rig, less flow in the model: against a rising pressure they differ.
+        # A narrower valve on a rig, less flow in the model: they differ against a rising pressure.
         (_P("loss", "%", 0.0, 95.0, 20.0, (c.BLOW_OFF,), relative_error=0.15),),
         _weak_blow_off,
     ),
@@ -471,7 +473,7 @@ EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in _TABLE}
 
 
 def standing_for(coefficient: int) -> tuple[Effect, Parameter]:
-    """The effect of the table, and its parameter, that stands for a change of a coefficient.
+    """The effect of the table, with its parameter, that changes a coefficient.
 
     StopIteration if there is none.
     """
@@ -485,21 +487,21 @@ def standing_for(coefficient: int) -> tuple[Effect, Parameter]:
 
 WEATHER = standing_for(c.AMBIENT)[0].name  # the effect that ``is_weather``
 
-_BESIDE: dict[str, Effect] = {}  # what acts beside the table
+_BESIDE: dict[str, Effect] = {}  # effects beside the table, by name
 
 
 def add_beside(effects: Mapping[str, Effect]) -> None:
-    """Let effects beside the table be known by name; the search for causes passes them over."""
+    """Register effects beside the table by name; the search for causes skips them."""
     _BESIDE.update(effects)
 
 
 def find_effect(name: str) -> Effect | None:
-    """The effect of a name, of the table or beside it; None where it is not known here."""
+    """The effect of a name, in the table or beside it; None if it is unknown."""
     return EFFECTS.get(name) or _BESIDE.get(name)
 
 
 def effect_of(name: str) -> Effect:
-    """The effect of a name, of the table or beside it. ConfigError where there is none."""
+    """The effect of a name, in the table or beside it; ConfigError if it is unknown."""
     effect = find_effect(name)
     if effect is None:
         raise ConfigError(f"unknown effect {name!r}", "twin effects lists them")
@@ -507,14 +509,14 @@ def effect_of(name: str) -> Effect:
 
 
 def acting_on(theta: Theta) -> list[Effect]:
-    """The effects that can act on a unit: what cannot is no hypothesis about it."""
+    """The effects of the table that can act on a unit; the others are no hypotheses."""
     return [effect for effect in _TABLE if effect.acts(theta)]
 
 
 def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     """Return ``theta`` with an effect at the given parameter values (missing ones neutral).
 
-    A law may stand beside them; where it is missing, the data set's holds.
+    ``values`` may contain a law; without one, the data set's law applies.
     Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
     """
     effect = effect_of(name)
@@ -537,9 +539,9 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
 
 
 def table(line_break: str = "<br>") -> str:
-    """The table of effects in Markdown, as the README has it.
+    """The table of effects in Markdown, for the README.
 
-    ``line_break`` stands between an effect's parameters: Markdown has none of its own in a table.
+    ``line_break`` separates the parameters of an effect; tables of Markdown have none.
     """
     lines = ["| effect | what it means | parameters |", "| --- | --- | --- |"]
     for effect in EFFECTS.values():

@@ -1,9 +1,9 @@
 """The compiled model: one call steps over many samples, for one hypothesis or many.
 
 ``state`` holds everything that ``advance`` needs from call to call. So the same samples give the
-same expected pressures to the last bit, whatever blocks they come in. Hypotheses that run together
-share their steps; the one that changes fastest sets the step size. Each result is within a fraction
-of a pascal of the hypothesis run alone.
+same expected pressures to the last bit, however they are divided into blocks. Hypotheses that run
+together share their steps; the one that changes fastest sets the step size. Each result is within
+a fraction of a pascal of the hypothesis run alone.
 """
 
 import math
@@ -70,19 +70,19 @@ from twin.model.plant import (
 from twin.model.plant import advance as advance_gas
 from twin.signals import Command, Phase, Signal
 
-# Rows of the state. First the gas and the lags that the plant integrates:
+# Rows of the state. First, gas and lags of the plant:
 PORT, PORT_MASS, LINE, LINE_MASS, VESSEL, VESSEL_MASS, NEAR, FAR, YIELDED = range(9)
 DRIVE, JET, BLOWING, DRAINED, SUPPLIED, SENSOR_STAGE, SENSED = range(9, ORDER)
 # Then the two valves, each with position, command and time since the command (s). The local error
 # of a step is ERROR_COEFFICIENT (Pa/s³) times the cube of its length. OPEN is above 0 while the cup
-# stands open. VALID is 1 once the model was set on a measured level. SIGNALS are Signal bits.
-# Last, for each mechanism: how far it has set in (0 to 1), the share of its size that acts, and
-# whether its vacuum is reached. RUN is the time (s) that the model has run.
+# is open. VALID is 1 once the model was set to a measured level. SIGNALS are Signal bits. Last, for
+# each mechanism: its state (0 to 1), the share of its size that acts, and whether its vacuum is
+# reached. RUN is the time (s) that the model has run.
 NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE = range(ORDER, ORDER + 6)
 ERROR_COEFFICIENT, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
 SET_IN, ACTS, REACHED = ORDER + 11, ORDER + 11 + SLOTS, ORDER + 11 + 2 * SLOTS
 RUN = REACHED + SLOTS
-JUST_OPEN = 1.0 + 1e-9  # of OPEN: the next step takes it for an event, and is finely divided
+JUST_OPEN = 1.0 + 1e-9  # of OPEN: marks an event, so that the next step has the most substeps
 STATE = RUN + 1
 
 # Hypotheses that run together with the same steps. LLVM vectorises the loop over them only if it is
@@ -91,12 +91,10 @@ LANES = 12
 LONGEST_STEP = 0.01  # s
 LONGEST_BRIDGE = 0.1  # s; after a longer gap the model waits for the next synchronisation
 NEVER = 1e9  # s, longer than every delay
-AT_ONCE = 1e-4  # s, time constant of a mechanism that sets in or fades without delay
+AT_ONCE = 1e-4  # s, time constant of a mechanism without delay
 # A step with an event has the most substeps: a valve moves, a cup opens, or blow-off passes ambient
 # pressure, where the exhaust opens. Any other step has as many as the tolerance requires.
-MOST_SUBSTEPS = (
-    24  # at TOLERANCE; fewer for a wider tolerance, in the same proportion as other steps
-)
+MOST_SUBSTEPS = 24  # at TOLERANCE; a wider tolerance reduces it in proportion, as for other steps
 NEWTON_PASSES = 6  # of Newton's method; enough from a start within a factor of ten
 TOLERANCE = 0.02  # Pa, permitted local error of a step, estimated at second order
 COARSE_TOLERANCE = 1.0  # Pa; still far below what a sensor resolves
@@ -105,13 +103,13 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 _SUCTION_COMMAND = int(Command.SUCTION)
 _PART_PRESENT, _AIR_SAVING = int(Signal.PART_PRESENT), int(Signal.AIR_SAVING)
 
-State = npt.NDArray[np.float64]  # STATE rows; a second axis where there are many hypotheses
+State = npt.NDArray[np.float64]  # (STATE,) or (STATE, hypotheses)
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
 
 
 def new_state(hypotheses: int | None = None) -> State:
-    """The state of a model that waits for its first synchronisation; it expects NaN until then."""
+    """The state of a model before its first synchronisation; until then it expects NaN."""
     state = np.zeros(STATE if hypotheses is None else (STATE, hypotheses))
     state[[NOZZLE_AGE, BLOW_AGE]] = NEVER
     return state
@@ -129,9 +127,9 @@ def advance(
 ) -> None:
     """Step the model over a block; write what the sensor should read (Pa) into ``expected``.
 
-    Each row has ``dt``, the seconds since the row before (negative: time was broken, and the model
-    waits for a synchronisation), the ``phase``, and ``level``, the pressure to synchronise on (Pa;
-    NaN in most rows). ``signals`` receives ``Signal`` bits. For n hypotheses, ``state`` is
+    Each row has ``dt``, the seconds since the row before (negative after a break of time: then the
+    model waits for a synchronisation), the ``phase``, and ``level``, the pressure to synchronise to
+    (Pa; NaN in most rows). ``signals`` receives ``Signal`` bits. For n hypotheses, ``state`` is
     (STATE, n), ``theta`` is (coefficients, n) and the results are (rows, n). ``phase`` and
     ``level`` are (rows,), or (rows, n) if each hypothesis has its own. The local error of each
     step is about ``tolerance`` (Pa).
@@ -155,10 +153,10 @@ def advance(
 
 @dataclass
 class Control:
-    """State of the ejectors' own controls: what a free run keeps beside ``State``."""
+    """State of the ejectors' own controls, which a free run needs beside ``State``."""
 
     air_saving: Floats  # (hypotheses, CONTROL)
-    timer: Floats  # of timed blow-off, (hypotheses, 2)
+    timer: Floats  # state of the timed blow-off, (hypotheses, 2)
 
     @classmethod
     def anew(cls, hypotheses: int = 1) -> "Control":
@@ -198,7 +196,7 @@ def run_on(
 ) -> None:
     """Run free as ``simulate`` does, and continue both ``state`` and ``control``.
 
-    So the same rows give the same results to the last bit, whatever blocks they come in.
+    The same rows give the same results to the last bit, however they are divided into blocks.
     ``outputs`` receives phase, pressure (Pa) and ``Signal`` bits, each (rows,) or
     (rows, hypotheses).
     """
@@ -593,7 +591,7 @@ def _shift_pressures(state: State, shift: float, i: int) -> None:
 
 @compiled
 def _synchronise(state: State, levels: Floats, k: Prepared) -> None:
-    """Set the model on a measured level (Pa); an open cup is at ambient whatever the reading."""
+    """Set the model to a measured level (Pa); with an open cup, to ambient pressure instead."""
     for i in range(state.shape[1]):
         level = levels[i]
         if math.isnan(level):
@@ -655,7 +653,7 @@ def _advance_lanes(
             lanes[VALID] = 0.0
         elif lanes[VALID, 0] > 0.0 and dt[row] > 0.0:
             _step(lanes, k, dt[row], tolerance)
-        for i in range(width):  # one column for all, or one for each
+        for i in range(width):  # one column for all hypotheses, or one for each
             phases[i] = phase[row, min(first + i, last) % phase.shape[1]]
             levels[i] = level[row, min(first + i, last) % level.shape[1]]
         _enter_phases(lanes, phases, k)
@@ -712,7 +710,7 @@ def _control_vacuum(state: State, k: Prepared, i: int) -> float:
 def _decide(
     state: State, controls: Floats, effective: Bytes, dt: float, k: Prepared, phases: Bytes
 ) -> None:
-    """Write the phases that the ejectors' own controls make of the effective commands."""
+    """Write the phases by which the ejectors' own controls follow the effective commands."""
     for i in range(state.shape[1]):
         suction_on = effective[i] == _SUCTION_COMMAND  # blow-off has priority
         nozzle_on = switch(

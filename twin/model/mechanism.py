@@ -2,9 +2,9 @@
 
 A mechanism has a *place* (a coefficient: a flow into the vessel, a share of suction, a volume, the
 sensor), a *condition* (always, while the nozzle runs, above a vacuum, periodically) and a *speed*
-(at once, or setting in and fading with time constants, as ice, water and warmth do). Its share runs
-from 0 to 1; the coefficient changes by ``SIZE`` times the share. A mechanism has a state, and holds
-for every program of commands.
+(at once, or setting in and fading with time constants, like ice, water and warmth). Its share runs
+from 0 to 1; the coefficient changes by ``SIZE`` times the share. A mechanism has a state, so it
+holds for every program of commands.
 """
 
 import math
@@ -18,7 +18,7 @@ from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
 
 SLOTS = 2  # number of mechanisms that can act at once
-# Coefficients of one mechanism, from ``c.MECHANISMS`` on; each has WIDTH of them.
+# Offsets of a mechanism's coefficients from ``c.MECHANISMS`` on; each mechanism has WIDTH of them.
 ON, SIZE, ALSO_ON, ALSO_SIZE, WHEN, BEGINS, ENDS, SETS_IN, FADES, PERIOD, SHIFT = range(11)
 WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
 # When it acts: always; while the nozzle runs; while it does not; in blow-off; above one vacuum
@@ -64,7 +64,7 @@ class When:
     code: int
     parameters: tuple[Parameter, ...]
     starts: tuple[tuple[float, ...], ...]
-    sentence: str  # with the parameters' values
+    sentence: str  # sentence with the parameters' values
     formula: str
     briefly: str = ""  # the sentence without values, if it has some
 
@@ -309,7 +309,7 @@ _SIGNED = {c.INFLOW, c.SENSOR_OFFSET}  # coefficients that may be negative
 # Conditions that only some places have. At other places, mechanisms that always act are effects of
 # the table; a period comes from a compressor or from another consumer.
 _ONLY = {"always": {"inflow"}, "swinging": {"supply", "inflow"}}
-# Conditions that a place does not have, since nothing would show.
+# Conditions that a place lacks, because a log would not show them.
 _NOT = {
     "nozzle": {"nozzle_off", "in_blow_off"},
     "blow_off": {"nozzle_on", "nozzle_off", "nozzle_on_slowly", "above", "used_up"},
@@ -336,7 +336,7 @@ class Mechanism:
 
     @property
     def effect(self) -> Effect:
-        """It as an effect, with its sizes and its other parameters."""
+        """The mechanism as an effect, with its sizes and its other parameters."""
         return Effect(
             self.name,
             f"{self._capitalised_sentence}: {self.when.name}",
@@ -346,13 +346,13 @@ class Mechanism:
         )
 
     def sentence(self, values: Mapping[str, float]) -> str:
-        """What it does, as a sentence with its values."""
+        """A sentence that describes the mechanism with its values."""
         sizes = ", ".join(_value_text(parameter, values) for parameter in self.place.parameters)
         condition = self.when.sentence.format(**self._value_texts(values))
         return f"{self._capitalised_sentence} ({sizes}), {condition}"
 
     def formula(self, values: Mapping[str, float]) -> str:
-        """What it changes in the model, and the equation of its share."""
+        """The changed coefficients, and the equation of the share."""
         added = "; ".join(
             f"{words} changes by {_value_text(parameter, values)} times the share"
             for words, parameter in zip(self.place.words, self.place.parameters, strict=True)
@@ -399,12 +399,12 @@ def _free_slots(theta: Theta) -> Iterator[int]:
 
 
 def free_slots(theta: Theta) -> int:
-    """Number of further mechanisms that can act."""
+    """Number of free slots for further mechanisms."""
     return sum(1 for _ in _free_slots(theta))
 
 
 def _limited(theta: Theta, coefficient: int, added: float) -> float:
-    """Change of a coefficient, limited: no flow, share or volume is negative, no cup vanishes."""
+    """``added``, limited so that no flow, share or volume is negative and no cup vanishes."""
     present = float(theta[coefficient])
     if coefficient == c.COMPLIANCE:
         added = min(added, FLATTEST * float(theta[c.VOLUME]) - present)
@@ -426,7 +426,7 @@ add_beside({name: mechanism.effect for name, mechanism in MECHANISMS.items()})
 
 
 def places_table() -> str:
-    """Where mechanisms act, in Markdown."""
+    """The table of places of mechanisms, in Markdown."""
     lines = ["| where | what it does | sizes |", "| --- | --- | --- |"]
     for place in PLACES.values():
         lines.append(f"| `{place.name}` | {place.sentence} | {_listed(place.parameters)} |")
@@ -434,7 +434,7 @@ def places_table() -> str:
 
 
 def whens_table() -> str:
-    """When and how mechanisms act, in Markdown."""
+    """The table of conditions and speeds of mechanisms, in Markdown."""
     lines = ["| when | what it means | what is to be known |", "| --- | --- | --- |"]
     for when in WHENS.values():
         words = when.sentence.replace("{", "`").replace("}", "`")

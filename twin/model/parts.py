@@ -46,7 +46,7 @@ class Filter(Settings):
     """A vacuum filter, clean."""
 
     kind: Literal["filter"]  # a vacuum filter
-    pressure_drop_mbar: NotNegative  # at nominal suction from ambient
+    pressure_drop_mbar: NotNegative  # pressure drop at nominal suction from ambient
     volume_ml: NotNegative = 0.0  # inside
 
 
@@ -54,7 +54,7 @@ class Sensor(Settings):
     """The place of the sensor that the PLC reads, with its tube. Without one it is at the port."""
 
     kind: Literal["sensor"]  # the place of the sensor
-    tube_length_mm: NotNegative = 0.0  # from the line to the sensor
+    tube_length_mm: NotNegative = 0.0  # length of the tube from the line to the sensor
     tube_diameter_mm: Positive = 4.0  # inside
 
 
@@ -63,19 +63,19 @@ class Vessel(Settings):
 
     kind: Literal["vessel"]  # a rigid vessel
     volume_ml: Positive  # inside
-    wall_area_cm2: Positive | None = None  # as a cylinder's, where it is not known
+    wall_area_cm2: Positive | None = None  # area of the wall, by default that of a cylinder
 
 
 class Cups(Settings):
     """Suction cups of one kind."""
 
     kind: Literal["cups"]  # suction cups
-    volume_ml: Positive  # of one, with its connection
-    count: int = Field(1, ge=1)  # how many there are
-    wall_area_cm2: Positive | None = None  # of one
-    shrinks_ml: NotNegative = 0.0  # of one, at full vacuum
-    lip_leak_sl_min: NotNegative = 0.0  # of one, sonic
-    open: int = Field(0, ge=0)  # how many have no part
+    volume_ml: Positive  # volume of one cup with its connection
+    count: int = Field(1, ge=1)  # number of cups
+    wall_area_cm2: Positive | None = None  # wall area of one cup
+    shrinks_ml: NotNegative = 0.0  # shrinkage of one cup at full vacuum
+    lip_leak_sl_min: NotNegative = 0.0  # sonic flow of one cup's lip leak
+    open: int = Field(0, ge=0)  # number of cups without a part
     free_flow_mbar: Positive = 5.0  # vacuum in one open cup that draws the whole nominal suction
     release_mbar: Positive = 20.0  # vacuum at which blow-off lets the part go
 

@@ -22,7 +22,7 @@ from twin.model.gas import CP, CRITICAL_RATIO, GAMMA, R, opening
 from twin.model.mechanism import ALSO_ON, ON, SLOTS, WIDTH
 from twin.model.theta import Theta
 
-# Values that follow from the coefficients, computed once a call, in rows behind them.
+# Rows of derived values behind the coefficients; they are computed once a call.
 (
     _SUCTION,
     _END,
@@ -38,13 +38,13 @@ from twin.model.theta import Theta
     _KINK_SLOPE,
     _AMBIENT_RATIO,
 ) = range(len(c.COEFFICIENTS), len(c.COEFFICIENTS) + 13)
-UNMOVED = len(c.COEFFICIENTS) + 13  # coefficients without the mechanisms on them, two per slot
+UNMOVED = len(c.COEFFICIENTS) + 13  # coefficients without their mechanisms' changes, two per slot
 PREPARED = UNMOVED + 2 * SLOTS
 
 Floats = npt.NDArray[np.float64]
 Prepared = npt.NDArray[np.float64]  # (PREPARED, hypotheses)
 
-# Limits that keep a runaway hypothesis finite, and gas in a node that is flushed within a step.
+# Limits that keep a divergent hypothesis finite, and gas in a node that is flushed within a step.
 LIGHTEST = 1e-15  # kg
 LOWEST, HIGHEST = 1.0, 1e7  # Pa
 COLDEST, HOTTEST = 60.0, 2000.0  # K
@@ -53,7 +53,7 @@ MOST_FLOW = 100.0  # kg/s
 NO_JET_BELOW = 0.25  # share of the opening of a full jet, below which there is no jet
 FAINTEST_JET = 1e-12  # a weaker jet counts as none: denormal numbers are slow
 
-TINY = 1e-9  # Pa, added to a divisor that may be zero
+TINY = 1e-9  # Pa, added to divisors that may be zero
 
 FREE_CONVECTION_AT = 10.0  # K between gas and wall, where the film coefficient holds at ambient
 
@@ -83,7 +83,7 @@ class Gas(NamedTuple):
     vessel_mass: float  # kg
     near: float  # kg/s, line to port
     far: float  # kg/s, vessel to line
-    yielded: float  # m³, by which creep has shrunk the vessel
+    yielded: float  # m³, shrinkage of the vessel by creep
 
 
 class Lags(NamedTuple):
@@ -92,7 +92,7 @@ class Lags(NamedTuple):
     drive: float  # 0 to 1, first stage of the jet
     jet: float  # 0 to 1
     valve: float  # 0 to 1, of the blow-off
-    drained: float  # 0 to 1, of the reservoir of blow-off
+    drained: float  # 0 to 1, drained share of the blow-off reservoir
     supply: float  # Pa gauge, at the nozzle
     sensor_stage: float  # Pa, first stage of the sensor
     sensed: float  # Pa, at the sensor
@@ -105,7 +105,7 @@ class Driven(NamedTuple):
     suction: float  # kg/s at ambient pressure in the port
     end: float  # Pa, end pressure
     blow_off: float  # kg/s
-    open: float  # 1 while the cup stands open
+    open: float  # 1 while the cup is open
 
 
 class Valves(NamedTuple):
@@ -113,7 +113,7 @@ class Valves(NamedTuple):
 
     nozzle: float  # 0 to 1
     blow_off: float  # 0 to 1
-    open_cup: float  # 1 while the cup stands open
+    open_cup: float  # 1 while the cup is open
 
 
 ORDER = len(Gas._fields) + len(Lags._fields)
@@ -121,9 +121,9 @@ ORDER = len(Gas._fields) + len(Lags._fields)
 
 @compiled
 def prepare_one(k: Prepared, i: int) -> None:
-    """Write the values that follow from the coefficients of hypothesis ``i`` below them.
+    """Write the derived values of hypothesis ``i`` into the rows below its coefficients.
 
-    Also keep the coefficients as they are without the mechanisms that change them.
+    Also store the coefficients without the mechanisms that change them.
     """
     for slot in range(SLOTS):
         first, unmoved = c.MECHANISMS + slot * WIDTH, UNMOVED + 2 * slot
@@ -134,7 +134,7 @@ def prepare_one(k: Prepared, i: int) -> None:
 
 @compiled
 def derive(k: Prepared, i: int) -> None:
-    """Write the values that follow from the present coefficients of hypothesis ``i``."""
+    """Write the values derived from the present coefficients of hypothesis ``i``."""
     ambient, nominal = k[c.AMBIENT, i], k[c.AMBIENT_NOMINAL, i]
     deviation = k[c.SUPPLY_NOMINAL, i] / k[c.SUPPLY_OPTIMUM, i] - 1.0
     peak = max(1.0 - k[c.SUPPLY_CURVATURE, i] * deviation * deviation, 1e-3)
@@ -171,7 +171,7 @@ def copy_column(to: Floats, i: int, source: Floats, j: int) -> None:
 
 @compiled
 def prepare(theta: Theta) -> Prepared:
-    """Coefficients (a column for each hypothesis), with the values that follow from them below."""
+    """Coefficients (a column for each hypothesis), with their derived values in the rows below."""
     k = np.empty((PREPARED, theta.shape[1]))
     for i in range(theta.shape[1]):
         copy_column(k, i, theta, i)
@@ -264,7 +264,7 @@ def port_flows(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, fl
     vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
     blown = driven.blow_off + fuller * (1.0 - p / ambient) + back * share
-    # A slope above zero could make the port's balance negative: then the flow stays as it is at p.
+    # A positive slope could make the port's balance negative: then the flow is constant.
     blown_slope = min(back * rise - fuller / ambient, 0.0)
     return (
         out - relief * relieves - vent * (share - rise * p),
@@ -315,7 +315,7 @@ def line_flow(
 
 @inlined
 def clamped_mass(mass: float, work: float) -> float:
-    """Mass (kg), limited so that gas with this p V (J) is neither too cold nor too hot."""
+    """Mass (kg), limited so that gas with p V = ``work`` (J) is between COLDEST and HOTTEST."""
     return min(max(mass, work * _PER_HOTTEST), work * _PER_COLDEST)
 
 
@@ -327,7 +327,7 @@ def per_joule(mass: float) -> float:
 
 @inlined
 def shrinkage(vessel: float, k: Prepared, i: int) -> tuple[float, float]:
-    """Final shrinkage of a vessel at its vacuum (m³), and its decrease with pressure (m³/Pa)."""
+    """Final shrinkage of a vessel at its vacuum (m³), and its fall with pressure (m³/Pa)."""
     vacuum = k[c.AMBIENT, i] - vessel
     held = k[c.STIFF_UNTIL, i] / (abs(vacuum) + k[c.STIFF_UNTIL, i] + TINY)
     pull = vacuum * (1.0 - held)
@@ -429,8 +429,8 @@ def solve(y: Gas, base: Gas, step: float, driven: Driven, k: Prepared, i: int) -
     leak_t = outside if y.vessel <= ambient else vessel_t
 
     # Pressures as value without flow, and slope over the flow.
-    # Heat comes by the temperatures that balance it: by pressures over masses of the pass before,
-    # passes would diverge where a small node's wall takes its warmth within a step.
+    # Heat follows from temperatures of the energy balance. With pressure over mass of a pass,
+    # passes would diverge if a small node exchanges its heat with the wall within a step.
     weight = 1.0 / (port_stored + out_slope * port_t - blown_slope * outside)
     gained = port_stored * base.port + blown * outside - out * port_t
     gained += port_warmth * (outside - port_t)
@@ -657,7 +657,7 @@ def advance(
 
 @inlined
 def without_faded(lags: Lags) -> Lags:
-    """Lags with those that have faded, or that the method has made negative, set to zero."""
+    """Lags, with faded ones and those that the method made negative set to zero."""
     return Lags(
         lags.drive if lags.drive > FAINTEST_JET else 0.0,
         lags.jet if lags.jet > FAINTEST_JET else 0.0,

@@ -33,7 +33,7 @@ class Term(Settings):
     ]  # the stretch that it is added in
     over: Literal["vacuum", "time"]  # mbar below ambient, or ms since the stretch began
     at: tuple[float, ...] = Field(min_length=1)  # the knots, rising
-    mbar: tuple[float, ...] = Field(min_length=1)  # at each knot
+    mbar: tuple[float, ...] = Field(min_length=1)  # correction at each knot
 
     @model_validator(mode="after")
     def _rising(self) -> Self:

@@ -1,6 +1,6 @@
-"""The model's coefficients: a vector in SI units, by name.
+"""The model's coefficients: a vector in SI units, indexed by name.
 
-The kernel works on it, a data set is turned into it, effects change it.
+The kernel reads it, a data set is converted into it, and effects change it.
 """
 
 from collections.abc import Mapping
@@ -217,7 +217,7 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
 ) = range(len(COEFFICIENTS))
 MECHANISMS = _mechanisms[0]  # where the coefficients of the mechanisms begin
 
-KINK_WIDTH = 0.03  # of the way from end pressure to ambient, over which a stage closes
+KINK_WIDTH = 0.03  # width of a stage's closing, over ambient less end pressure
 
 Theta = npt.NDArray[np.float64]  # one value per coefficient
 

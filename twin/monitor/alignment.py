@@ -1,11 +1,11 @@
-"""Align the breakpoints of one kind: move each to where it fits their mean course best.
+"""Align the breakpoints of one kind: move each to where it fits their mean curve best.
 
 The valve's stroke, the line and the sensor round all breakpoints of a record in the same way. All
 of them together give that common shape; then noise only affects the time of each.
 
 A nozzle that closes slowly rounds its breakpoint so much that the slope hardly breaks. But the
-control switches at a pressure. So the courses are aligned by when they pass a pressure as well,
-and that alignment counts if it makes them much more alike.
+control switches at a pressure. So the curves are also aligned by when they pass a common pressure.
+That alignment counts if it makes the curves much more similar.
 """
 
 from collections.abc import Sequence
@@ -17,25 +17,26 @@ import numpy.typing as npt
 from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, turns, vertex
 from twin.signals import MS
 
-FEWEST = 3  # breakpoints, for a mean course
-AROUND = 40.0 * MS  # a break on either side, where courses are compared
-CLEAR = 5.0  # sigmas of a reading
-# Share of the squares. On 35 rigs of another world and 7 shared ones it is 0.007 and 0.13 where the
-# pressure places breaks better, and 0.46 or more where the breaks place themselves.
+FEWEST = 3  # least number of breakpoints for a mean curve
+AROUND = 40.0 * MS  # compared time on either side of a break
+CLEAR = 5.0  # least difference in sigmas of a reading
+# Largest share of the squares that alignment by pressure leaves. On 35 rigs of another simulated
+# world and 7 shared ones it is 0.007 and 0.13 where the pressure places breaks better, and 0.46 or
+# more where the slope does.
 MUCH_MORE_ALIKE = 0.25
-FINE_ROWS = 30  # least rows of such a course: a hose rings in some 20 ms
-ELSEWHERE = 3.0  # rms over noise, from which the course about a knee is another than the usual one
+FINE_ROWS = 30  # least rows of such a curve: a hose rings in some 20 ms
+ELSEWHERE = 3.0  # rms over noise, from which the curve about a breakpoint is unlike the usual one
 ROUNDS, NARROWS = 4, 0.7
 OF_NOISE = 40.0  # variance factor of the time, as in ``breakpoints``, with the common shape known
 LEAST, LEAST_ROWS = 80.0 * MS, 12  # shortest window on either side
-ROOM = 0.8  # of the room that three quarters of the breakpoints have on either side
+ROOM = 0.8  # share of the time that three quarters of the breakpoints have on either side
 POINTS, PLACES = 60, 61
-FARTHEST, ROWS, SHARE = 30.0 * MS, 2.0, 0.4  # largest shift in a round; share of the window
-ROUNDED = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # of the window: where the mean course may bend
+FARTHEST, ROWS, SHARE = 30.0 * MS, 2.0, 0.4  # largest shift in a round: s, rows, of the window
+ROUNDED = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # of the window: where the mean curve may bend
 OWN, ALIKE = (
     [0, 1, 4],
     [2, 3, *range(5, 7 + len(ROUNDED))],
-)  # columns: level and slopes are each breakpoint's own
+)  # columns: each breakpoint has its own level and slopes
 
 
 @dataclass
@@ -45,19 +46,19 @@ class Knee:
     on: bool
     time: float  # s
     level: float  # Pa
-    rows: tuple[int, int]  # from the breakpoint or command before it to that after it
+    rows: tuple[int, int]  # from the breakpoint or command before it to the one after it
     jump: float  # Pa/s, change of the slope
-    scale: float  # s, over which the course is approximately a parabola
+    scale: float  # s, over which the curve is approximately a parabola
     stepped: bool = False
-    later: bool = False  # in a suction whose nozzle went on again before
-    held: float = np.nan  # Pa, at the end of suction, if the nozzle is off until then
+    later: bool = False  # not the first of its suction: the nozzle went on again before
+    held: float = np.nan  # Pa at the end of suction, if the nozzle is off until then
 
 
 def align_by_level(course: Course, knees: Sequence[Knee]) -> None:
-    """Move the ``knees`` of falls to where they pass a common pressure, if that suits better.
+    """Move the ``knees`` of falls to where they pass a common pressure, if that fits better.
 
-    It does where their courses are much more alike then. The first falls of suctions and later ones
-    have courses of their own, and pass the pressure by a time of their own before the knee.
+    It fits better if their curves are then much more similar. First and later falls of suctions
+    are treated apart: each kind has its own curve and its own time from pressure to breakpoint.
     """
     if len(knees) < FEWEST:
         return
@@ -79,13 +80,13 @@ def align_by_level(course: Course, knees: Sequence[Knee]) -> None:
 
 
 def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
-    """Move each knee to where the course about it is most like the usual one, if that is much more.
+    """Move each breakpoint to where its curve is most like the usual one, if much more so.
 
-    A line that rings after the nozzle has closed breaks the slope again and again: some knees may
-    be at another of these breaks than most. Levels and slopes of the courses do not count. If most
-    are at a later break, all move to the first one: to where the fall ends for the first time.
-    Knees that come sooner after one another than such a course lasts stay where they are. So do all
-    in rows too far apart to show a line ring.
+    A line that rings after the nozzle has closed breaks the slope repeatedly, so some breakpoints
+    may be at another of these breaks than most. Levels and slopes of the curves do not count. If
+    most are at a later break, all move to the first end of the fall. Breakpoints closer to one
+    another than the compared time stay where they are. All stay if the rows are too far apart to
+    show a ringing line.
     """
     times = np.array([knee.time for knee in knees])
     rows = np.array([knee.rows for knee in knees], np.int64).reshape(-1, 2)
@@ -111,7 +112,7 @@ def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
 
 
 def _bent(course: Course, times: Floats) -> Floats:
-    """The course (Pa) about times, each part without its own line, (times, rows)."""
+    """The curve (Pa) about times, each less its own straight line, (times, rows)."""
     offsets = np.arange(-AROUND, AROUND, course.period)
     straight = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(offsets)), 2))[0]
     values = np.interp(times[:, None] + offsets, course.time, course.pressure)
@@ -120,9 +121,9 @@ def _bent(course: Course, times: Floats) -> Floats:
 
 
 def _first_end_of_fall(course: Course, times: Floats) -> float:
-    """Time (s, not positive) from breaks to where the usual fall before them has ended already.
+    """Offset (s, not positive) from the breaks to the first end of the usual fall before them.
 
-    0 if it only falls up to the break.
+    0 if the pressure falls up to the break.
     """
     offsets = np.arange(-AROUND, 0.5 * course.period, course.period)
     falls = np.interp(times[:, None] + offsets, course.time, course.pressure)
@@ -131,14 +132,14 @@ def _first_end_of_fall(course: Course, times: Floats) -> float:
 
 
 def _passed_by_all(course: Course, knees: Sequence[Knee]) -> float:
-    """The pressure (Pa) of most ``knees``, or a higher one that all courses fall below."""
+    """The usual pressure (Pa) of ``knees``, or a higher one that all curves fall below."""
     lowest = [course.pressure[slice(*knee.rows)].min() for knee in knees]
     surely = float(max(lowest)) + CLEAR * course.noise.single
     return max(float(np.median([knee.level for knee in knees])), surely)
 
 
 def _passes(course: Course, knee: Knee, level: float) -> float:
-    """Time (s) at which the course before or after a knee falls to ``level``; NaN if not."""
+    """Time (s) at which the curve about a breakpoint falls to ``level``; NaN if it does not."""
     begin, end = knee.rows
     below = course.pressure[begin:end] <= level
     row = int(below.argmax())
@@ -149,7 +150,7 @@ def _passes(course: Course, knee: Knee, level: float) -> float:
 
 
 def _difference(course: Course, knees: Sequence[Knee], times: Floats) -> float:
-    """Sum (Pa²) over rows of how far the courses about ``times`` are from the usual one."""
+    """Sum of squares (Pa²) of the curves about ``times`` less the usual one."""
     offsets = np.arange(-AROUND, AROUND, course.period)
     ends = np.array([course.time[knee.rows[1] - 1] for knee in knees])
     at = times[:, None] + offsets
@@ -159,7 +160,7 @@ def _difference(course: Course, knees: Sequence[Knee], times: Floats) -> float:
 
 
 def align(course: Course, knees: Sequence[Knee]) -> None:
-    """Move ``knees``, all of one kind, in place. Those with a step stay where it is."""
+    """Align ``knees``, all of one kind, in place. One with a pressure step stays at its step."""
     if len(knees) < FEWEST or np.mean([knee.stepped for knee in knees]) > 0.5:
         return
     half = _window(course, knees)
@@ -188,7 +189,7 @@ def align(course: Course, knees: Sequence[Knee]) -> None:
 
 
 def _window(course: Course, knees: Sequence[Knee]) -> float:
-    """Window (s) on either side that gives precise times, and that most breakpoints have."""
+    """Window (s) on either side: precise times, and room for it at most breakpoints."""
     period, noise = course.period, course.noise
     jump, scale = (
         float(np.median(values)) for values in zip(*((k.jump, k.scale) for k in knees), strict=True)
@@ -208,12 +209,12 @@ def _window(course: Course, knees: Sequence[Knee]) -> float:
 
 @dataclass(frozen=True)
 class _CourseAtKnees:
-    """The course about breakpoints, at the same times before and after each."""
+    """The curve about breakpoints, at the same times before and after each."""
 
     course: Course
-    rows_per_point: int  # rows of which each value is the mean
-    half: float  # s
-    wide: Floats  # s, times about a breakpoint, farther than it is moved
+    rows_per_point: int  # rows averaged in each value
+    half: float  # s, compared on either side
+    wide: Floats  # s, times about a breakpoint, with a margin for its shift
     count: int  # values compared on either side
 
     @property
@@ -234,7 +235,7 @@ class _CourseAtKnees:
         return means
 
     def mean_course(self, times: Floats, ends: Floats) -> Floats:
-        """Common course (Pa) about all breakpoints, without their own level and slopes."""
+        """Common curve (Pa) about all breakpoints, less their own levels and slopes."""
         columns = _knee_columns(self.wide / self.half)
         shape_columns, residuals = list[Floats](), list[Floats]()
         for time, (low, high) in zip(times, ends, strict=True):
@@ -274,7 +275,7 @@ class _CourseAtKnees:
         return float(shifts[best]) + vertex(rss, best) * float(shifts[1] - shifts[0])
 
     def break_offset(self, times: Floats, ends: Floats, sign: float) -> float:
-        """Time (s) at which the mean course breaks."""
+        """Offset (s) at which the mean curve breaks."""
         narrow = self.narrow
         curves = [
             self.at(time + narrow)
@@ -292,7 +293,7 @@ class _CourseAtKnees:
 
 
 def _knee_columns(u: Floats) -> npt.NDArray[np.float64]:
-    """Columns of a course with a rounded break at 0: cubics on either side, and bends about it."""
+    """Columns of a curve with a rounded break at 0: cubics on either side, and bends about it."""
     after = np.maximum(u, 0.0)
     columns = [u**0, u, u * u, u**3, after, after**2, after**3]
     return np.stack(columns + [np.maximum(u - offset, 0.0) for offset in ROUNDED], axis=1)

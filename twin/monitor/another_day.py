@@ -1,10 +1,10 @@
 """Uncertainty of the model on another day than that of the calibration.
 
-The model takes over ambient pressure and temperature, and real ejectors scatter about its
-prediction. Their end pressure follows ambient in proportion, as in the model, or one to one if the
-jet makes a vacuum of its own. Flows go with density, sonic ones with the root of temperature, or
-with neither. So uncertainty grows with the distance to the day of the calibration. Temperature is
-unknown as well if nobody measures it.
+The model follows ambient pressure and temperature; real ejectors scatter about its prediction.
+Their end pressure follows ambient in proportion, as in the model, or one to one if the jet makes a
+vacuum of its own. Flows are proportional to density, sonic flows to the root of temperature, or to
+neither. So the uncertainty grows with the distance from the day of the calibration. Temperature is
+uncertain as well if nobody measures it.
 """
 
 import math
@@ -21,12 +21,12 @@ BAROMETER = 2.0 * MBAR  # Pa, one sigma; cheap ones are within 3 or 4 mbar
 # Pa, one sigma of the pressure sensor's zero: without a barometer, the calibration of an opened
 # system has taken the sensor's reading for ambient.
 ZERO = 2.0 * MBAR
-# K, one sigma of how far apart two unmeasured days are. Each is known to 10 K: 15 °C and 35 °C are
-# both within a year's two sigmas.
+# K, one sigma of the difference between two days without a thermometer. The sigma of each is 10 K:
+# 15 °C and 35 °C are both within a year's two sigmas.
 HALL_K = 10.0 * math.sqrt(2.0)
-SMALLEST = 1e-4  # a smaller relative change is left out
-# Coefficients that vary together: suction, blow-off, what it leaves through, leaks, and friction in
-# the line. Blow-off comes from the supply and does not vary with what it leaves through.
+SMALLEST = 1e-4  # least relative change that counts
+# Coefficients that vary together: suction, blow-off, its outlets, leaks, and friction in the line.
+# Blow-off comes from the supply and does not vary with its outlets.
 ALIKE = (
     (c.SUCTION,),
     (c.BLOW_OFF,),

@@ -13,16 +13,16 @@ from twin.monitor.change_detection import Floats, Reference, as_normal
 from twin.monitor.false_alarm_budget import SINGLE_CYCLES, cycles_between, normal_limit
 from twin.monitor.healthy import Healthy
 
-LEARNED = 300  # healthy cycles of the unit: then a scatter is known to 4 %
-LEARNED_WITHIN = 3.5  # sigmas: cycles farther out are not learned
+LEARNED = 300  # healthy cycles of the unit, after which a scatter is known to 4 %
+LEARNED_WITHIN = 3.5  # sigmas; a cycle farther out is not learned
 
 
 class Baseline:
     """The figures of one unit's healthy cycles, in the order of ``names``; all values in mbar.
 
-    The distribution of an ``_rms`` depends on the number of things that scatter. With one it is the
-    size of a normal value about zero; with several it is closer to its mean. It is judged as the
-    first, so that it does not exceed a limit more often than wanted.
+    The distribution of an ``_rms`` depends on the number of quantities that scatter. With one it is
+    the absolute value of a normal variable; with several it is closer to its mean. The first is
+    assumed, so that a figure does not exceed its limit more often than wanted.
     """
 
     def __init__(self, healthy: Healthy) -> None:
@@ -37,18 +37,18 @@ class Baseline:
 
     @property
     def sigma(self) -> Floats:
-        """One sigma of each figure, as known so far."""
+        """Present estimate of each figure's sigma."""
         sigma: Floats = np.sqrt(self._reference.squares / (self._reference.count - 1.0))
         return sigma
 
     def excess(self, figures: Mapping[str, float]) -> Floats:
-        """Distance of each figure from its mean, an rms only above; NaN if the cycle lacks it."""
+        """Each figure less its mean: absolute, of an rms only if positive; NaN without a value."""
         off = self._values(figures) - self._reference.mean
         excess: Floats = np.where(self._is_rms, np.maximum(off, 0.0), off)
         return excess
 
     def normal(self, figures: Mapping[str, float], smallest: float) -> Floats:
-        """Each figure as a standard normal value, if the cycle is healthy; NaN if it lacks one.
+        """Each figure as a standard normal value under a healthy unit; NaN without a value.
 
         Distances up to ``smallest`` from the mean count as none.
         """
@@ -64,9 +64,9 @@ class Baseline:
         )
 
     def limit(self, days: float, seconds: float, shown: int) -> float:
-        """The normal value at which one of the figures ``shown`` is an alarm.
+        """The normal value at which one of ``shown`` figures raises an alarm.
 
-        ``days`` are those between false alarms of any kind; a cycle takes ``seconds``.
+        ``days`` is the mean time between false alarms of any kind; a cycle takes ``seconds``.
         """
         return normal_limit(cycles_between(days, SINGLE_CYCLES, seconds), shown)
 

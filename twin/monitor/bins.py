@@ -17,9 +17,9 @@ from twin.model.term import AGAIN
 from twin.signals import MS, Phase
 
 EARLIEST_S, LATEST_S = 5e-3, 0.3  # correlation time of an error, at an edge and long after it
-PER_UNIT = 4  # bins in each unit of warped time
-SPARSE, FARTHEST = 20, 10  # spacing of kept rows: a SPARSEth of the rows past, at most FARTHEST
-ROWS = 10_000  # of a stretch: the table of bins' first rows grows by so many
+PER_UNIT = 4  # bins per unit of warped time
+SPARSE, FARTHEST = 20, 10  # spacing of kept rows: rows since a break / SPARSE, up to FARTHEST
+ROWS = 10_000  # of a stretch, by which the table of bins' first rows grows
 Bytes = npt.NDArray[np.uint8]
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float64]
@@ -31,13 +31,13 @@ _SUCTION, _HOLD = int(Phase.SUCTION), int(Phase.HOLD)  # plain: enumerations are
 class Bins:
     """Bins in order of time; no bin crosses a phase change."""
 
-    number: Ints  # of the bin of each row; -1 if the row cannot be compared
-    count: Ints  # rows
+    number: Ints  # bin of each row; -1 if the row cannot be compared
+    count: Ints  # rows in each bin
     cycle: Ints
-    stretch: Ints  # of one phase, counted over all rows
-    kind: Ints  # of stretch, index into KINDS
+    stretch: Ints  # number of the stretch of one phase, counted over all rows
+    kind: Ints  # kind of stretch, index into KINDS
     since: Ints  # rows since the stretch began
-    step: Ints  # of warped time, counted since the stretch began
+    step: Ints  # steps of warped time since the stretch began
 
     @cached_property
     def time(self) -> Floats:
@@ -57,7 +57,7 @@ class Bins:
         turn = np.zeros(len(stretches), np.int64)
         for stretch_kind in np.unique(kind):
             of_kind = np.flatnonzero(kind == stretch_kind)
-            begins = np.searchsorted(cycle[of_kind], cycle[of_kind])  # stretches go by time
+            begins = np.searchsorted(cycle[of_kind], cycle[of_kind])  # ordered by time
             turn[of_kind] = np.arange(len(of_kind)) - begins
         return (turn[number] << 24) + self.place
 
@@ -81,14 +81,14 @@ class Bins:
 
 
 def warped(seconds: Floats) -> Floats:
-    """Warped time: errors stay correlated for about 1 of it."""
+    """Warped time, in units of the correlation time of the model's error."""
     early = np.minimum(seconds, LATEST_S - EARLIEST_S)
     late: Floats = (seconds - early) / LATEST_S
     return np.log1p(early / EARLIEST_S) + late
 
 
 def unwarped(time: Floats) -> Floats:
-    """Seconds of a warped time."""
+    """The inverse of ``warped``, in seconds."""
     turn = np.log1p((LATEST_S - EARLIEST_S) / EARLIEST_S)
     early = EARLIEST_S * np.expm1(np.minimum(time, turn))
     seconds: Floats = early + np.maximum(time - turn, 0.0) * LATEST_S
@@ -96,9 +96,9 @@ def unwarped(time: Floats) -> Floats:
 
 
 def binned(phase: Bytes, usable: Bools, starts: Ints, per_unit: int = PER_UNIT) -> Bins:
-    """Bins of rows whose phases are given; ``starts`` are the first rows of cycles.
+    """Bins of rows by their ``phase``; ``starts`` are the first rows of cycles.
 
-    Rows before the first of them belong to cycle -1.
+    Rows before the first cycle belong to cycle -1.
     """
     number = np.empty(len(phase), np.int64)
     begins = _begins(len(phase) // ROWS + 1, per_unit)
@@ -121,7 +121,7 @@ def averaged(
 
 @lru_cache(maxsize=16)
 def _begins(times: int, per_unit: int) -> Ints:
-    """Rows of a stretch before each step of warped time, for at least ``times`` ROWS."""
+    """First row of each step of warped time in a stretch of at least ``times`` × ROWS rows."""
     steps = np.arange(int(warped(np.array(times * ROWS * MS)) * per_unit) + 2)
     return np.ceil(unwarped(steps / per_unit) / MS).astype(np.int64)
 
@@ -164,7 +164,7 @@ def _between(drawn: Ints, expected: Floats, off: Floats) -> Bools:
 
 @compiled
 def _add_lines(number: Ints, drawn: Ints, values: Floats, sums: Floats) -> None:
-    """Add the values of lines through ``values`` at each row to the sum of its bin."""
+    """Interpolate ``values`` linearly at each row, and add them to the sum of its bin."""
     for after in range(len(drawn)):
         before = max(after - 1, 0)
         first, last = drawn[before], drawn[after]
@@ -182,20 +182,20 @@ def _add_lines(number: Ints, drawn: Ints, values: Floats, sums: Floats) -> None:
 
 @per_row
 def _add(total: Floats, times: float, values: Floats) -> None:
-    """Add ``times`` the values."""
+    """Add ``values`` × ``times`` to ``total``."""
     for i in range(len(total)):
         total[i] += times * values[i]
 
 
 @compiled
 def _number(phase: Bytes, usable: Bools, starts: Ints, begins: Ints, number: Ints) -> Ints:
-    """Number the bin of each row, and give the columns of each bin, (bins, 6).
+    """Write the bin of each row into ``number``; return the columns of each bin, (bins, 6).
 
-    Rows, cycle, stretch, its kind, rows since it began, and steps in warped time.
+    Columns: rows, cycle, stretch, its kind, rows since it began, and steps of warped time.
     """
     columns = np.empty((len(phase), 6), np.int64)
     bins, cycle, stretch, first, again = 0, -1, -1, 0, False
-    step, used = 0, -1  # of warped time; the last with a bin
+    step, used = 0, -1  # step of warped time, and the last step with a bin
     for row in range(len(phase)):
         begun = row == 0 or phase[row] != phase[row - 1]
         while cycle + 1 < len(starts) and starts[cycle + 1] <= row:
@@ -219,8 +219,8 @@ def _number(phase: Bytes, usable: Bools, starts: Ints, begins: Ints, number: Int
 def drawn(dt: Floats, begins: npt.NDArray[np.bool_]) -> Ints:
     """Subsampled rows for linear interpolation; ``begins`` marks breakpoints, ``dt`` is in seconds.
 
-    Rows beside a missing row are kept, as interpolation counts rows. All rows are kept if they are
-    so far apart that the model could not step over the others.
+    Rows beside a missing row are kept, since interpolation counts rows. All rows are kept if the
+    model cannot step over several of them at once.
     """
     intervals = dt[dt > 0.0]
     period = float(np.median(intervals)) if len(intervals) else MS
@@ -249,7 +249,7 @@ def sparse_rows(begins: Bools, since: int) -> Ints:
         since += 1
         if begins[row]:
             since = due = 0
-        if since == due or row + 1 == len(begins) or begins[row + 1]:  # the last before as well
+        if since == due or row + 1 == len(begins) or begins[row + 1]:  # or the last of a stretch
             kept[count] = row
             count += 1
         if since == due:

@@ -1,7 +1,7 @@
-"""Breakpoints of the slope of a noisy course: local polynomials, free on either side.
+"""Breakpoints of the slope of a noisy curve: local polynomials, free on either side.
 
 No model of the system is used. Windows follow from the noise, the sampling and the slope of the
-course; all lengths are times, whatever the sampling.
+curve; all lengths are times, whatever the sampling.
 """
 
 import math
@@ -23,33 +23,33 @@ Rows = tuple[int, int]  # first, and last exclusive
 # hum; with their few rows that quantile is less than the mean.
 MAINS, SHORT, FEWEST, FEWEST_SHORT = 20.0 * MS, 8.0 * MS, 16, 8
 QUIET, SHORT_QUIET = 0.3, 0.77
-ENOUGH = 10  # windows that a part needs to show its noise
-HUM = 0.02  # share of the variance of hum over a period that remains in longer windows
+ENOUGH = 10  # least windows in a part for an estimate of its noise
+HUM = 0.02  # share of the hum's variance that remains in windows longer than its period
 HUMS = 1.5  # noise of long windows over that of short ones, above which there is hum
-WIDTHS = (1, 3, 5, 9, 15, 21)  # rows over which readings are smoothed, until the noise is below
-CALM = 0.00125  # this share of the record's range
-SHARE_OF_STEP = 12.0**-0.5  # sigma of quantisation noise, over a step of the converter
+WIDTHS = (1, 3, 5, 9, 15, 21)  # rows of the moving mean: the first with noise below CALM
+CALM = 0.00125  # noise over the record's range
+SHARE_OF_STEP = 12.0**-0.5  # sigma of quantisation noise over a step of the converter
 
 WANTED = 1.5 * MS  # wanted sigma of the time of a break
-OF_A_ROW = 0.3  # the same in rows, if they are far apart
+OF_A_ROW = 0.3  # wanted sigma in rows, if they are far apart
 OF_NOISE = 18.0  # variance of a break between two free parabolas, 4.2² (W·Δ²/density)⁻¹
-LEAST, LEAST_ROWS = 30.0 * MS, 12  # window
+LEAST, LEAST_ROWS = 30.0 * MS, 12  # shortest window
 OUTER = 1e-9  # keeps the normal equations solvable
 AT_ONCE = 16  # bins per window in a search
 POINTS, PLACES = 192, 61  # points of a thinned window; times at which a break is tried
 STEP_POINTS = 80
-CLEAR, FIRST = 8.0, 0.6  # least sigmas of a break; an earlier one with this share of them wins
-RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # s; sigmas; times as far away; share
-# A sensor that is slower than the rows repeats readings where the pressure falls from row to row by
-# more than some steps of the converter. Rows over which that is seen, and share of repeats.
+CLEAR, FIRST = 8.0, 0.6  # least sigmas of a break; share of them with which an earlier one wins
+RINGS, AWAY, COMES_BACK, FOOT = 60.0 * MS, 5.0, 1.5, 0.2  # ``rung``: s, sigmas, ratio, share
+# A sensor that is slower than the rows repeats readings while the pressure falls. Rows over which
+# the fall is taken, its least size per row in converter steps, rows needed, and share of repeats.
 REPEATS_FOR, REPEATS_STEPS, FEWEST_FALLS, LEAST_REPEATED = 20, 2.0, 30, 0.25
 STEP_CLEAR, STEP_GAIN = 10.0, 20.0  # least sigmas of a break with a step; least χ² it must gain
 
 
 def turns(smooth: Floats, least: float) -> list[int]:
-    """Rows of lows and highs in turn, a low first, between which it moves by ``least`` or more.
+    """Rows of alternating lows and highs, a low first, that differ by ``least`` or more.
 
-    ``smooth`` begins by falling. A last turn that nothing follows does not count.
+    ``smooth`` begins by falling. A last turn without a reversal after it does not count.
     """
     rows, falling, best, best_value = list[int](), True, 0, float(smooth[0])
     for row, value in enumerate(smooth.tolist()):
@@ -68,17 +68,17 @@ def converter_step(pressure: Floats) -> float:
 
 
 def rounding_error(step: float, noise: float) -> float:
-    """Rms error that rounding to steps leaves in a mean over many readings of one pressure.
+    """Rms rounding error of a mean over many readings of one pressure.
 
-    ``noise`` is one sigma of readings, that of rounding included; all in one unit. Noise beneath
-    the steps lets means come closer: the first harmonic of the rounding error remains (Widrow).
+    ``noise`` is one sigma of readings, with that of rounding; both are in one unit. Noise below
+    the steps reduces the error of means: its first harmonic remains (Widrow).
     """
     beneath = max(noise**2 - (SHARE_OF_STEP * step) ** 2, 0.0)
     return SHARE_OF_STEP * step * math.exp(-2.0 * math.pi**2 * beneath / step**2) if step else 0.0
 
 
 def renewed_every(pressure: Floats, sucks: npt.NDArray[np.bool_]) -> float:
-    """Rows from a new reading to the next where the pressure falls in suction; 0 if each is new."""
+    """Mean rows from one new reading to the next as the pressure falls; 0 if every row is new."""
     changes = np.diff(pressure)
     if len(changes) < REPEATS_FOR:
         return 0.0
@@ -121,10 +121,10 @@ class Noise:
     period: float  # s, median time between readings
     single: float  # Pa, of single readings, with hum
     width: int  # rows; a mean over them is quiet enough to show turns of the pressure
-    quiet: float  # Pa, noise of such means
+    quiet: float  # Pa, noise of means over ``width`` rows
     density: float  # Pa²·s; divided by a time it is the variance of a mean over that time
     steps: float  # Pa³; divided by the slope it is the density for the converter's steps
-    correlated: float  # s, correlation time of the noise: shorter windows say nothing
+    correlated: float  # s, correlation time of the noise; shorter windows show nothing
     hum: bool
 
     @classmethod
@@ -176,7 +176,7 @@ class Noise:
 
 
 class Course(NamedTuple):
-    """Usable readings, in order of time."""
+    """Usable readings in order of time."""
 
     time: Floats  # s
     pressure: Floats  # Pa
@@ -208,7 +208,7 @@ class Break(NamedTuple):
     """A break of the slope."""
 
     time: float  # s
-    level: float  # Pa, to which the course before it leads
+    level: float  # Pa, by the curve before it
     jump: float  # Pa/s, change of the slope
     clear: float  # significance in sigmas
     stepped: bool  # the pressure jumps as well
@@ -226,7 +226,7 @@ def hinge(left: int, right: int) -> Floats:
 
 
 def closer(course: Course, rows: Rows, row: int, window: int, jump: float) -> tuple[int, int]:
-    """Follow a break to shorter windows while it stays clear: its row, and the last window (rows).
+    """Follow a break to shorter windows while it stays significant: its row and last window (rows).
 
     If a line rings, each swing breaks the slope: the first one is the break. ``jump`` is negative
     if the slope decreases.
@@ -306,9 +306,9 @@ def stepped(course: Course, rows: Rows, row: int, window: int, jump: float) -> B
 
 
 def rung(course: Course, rows: Rows, time: float, scale: float) -> Break | None:
-    """The point where the pressure first left its course, if it came back to it before ``time``.
+    """The point where the pressure first left its curve, if it came back to it before ``time``.
 
-    A ringing line does that: a later swing may break the slope more than the first. The course
+    A ringing line does that: a later swing may change the slope more than the first. The curve
     before it is approximately a parabola over ``scale`` (s).
     """
     period, noise = course.period, course.noise

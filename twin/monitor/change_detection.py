@@ -1,11 +1,11 @@
 """Change detection: sums over cycles that find changes too small for a single cycle.
 
-The input is one score for each suspect and cycle. Scores are made standard normal from those before
-(Hawkins' self-starting method), so that no table of healthy means has to be exact. Each suspect,
-sign and size has likelihood ratios of "it began at cycle t" to "nothing did". They are summed over
-all t (Shiryaev and Roberts). In healthy cycles the weighted sum over all suspects grows by 1 a
-cycle on average, however similar their signatures are. So a limit on it is the number of cycles to
-a false alarm, except for the overshoot.
+The input is one score for each suspect and cycle. Scores are standardised by those before (Hawkins'
+self-starting method), so that no table of healthy means has to be exact. Each suspect, sign and
+size has likelihood ratios of "it began at cycle t" to "nothing changed". They are summed over all t
+(Shiryaev and Roberts). In healthy cycles the weighted sum over all suspects grows by 1 a cycle on
+average, however similar their signatures are. So a limit on it is the number of cycles to a false
+alarm, except for the overshoot.
 """
 
 import math
@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 SIZES = np.array([0.5, 1.0, 2.0])  # sizes of a change, in sigmas per cycle
-SHARES = np.array([0.32, 0.26, 0.42])  # of the weight, of each size
+SHARES = np.array([0.32, 0.26, 0.42])  # share of the prior weight of each size
 # Power of the cosine by which similar suspects share one weight. When the sum of one is at its
 # limit, exp(14), that of its neighbour is at exp(14 cos^2): below 0.9 it hardly contributes.
 ALIKE = 10
@@ -28,9 +28,9 @@ ALIKE = 10
 OVERSHOOT = float(SHARES @ np.exp(-0.583 * SIZES))
 # Largest score (sigmas) of a cycle, unless its own figures are out: a misread edge is no change.
 MOST = 5.0
-STRANGE = 3.5  # sigmas: a larger score is not learned at once, as a change may begin
-WAITS = 4  # cycles for which learning then pauses; the sums of a large change alarm by that time
-MOST_WAITING = 20  # cycles: scores that stay strange without an alarm are then learned
+STRANGE = 3.5  # sigmas: a larger score is not learned at once, since a change may begin
+WAITS = 4  # cycles for which learning then pauses; a large change raises an alarm by then
+MOST_WAITING = 20  # cycles after which scores that stay strange without an alarm are learned
 FARTHEST = 30.0  # sigmas; the probability beyond underflows
 # Prior cycles with neither skewness nor correlation; sigmas at which scores are clipped for both.
 UNSKEWED, COUNTS = 100.0, 4.0
@@ -50,13 +50,13 @@ class Reference:
 
     @classmethod
     def of(cls, suspects: int) -> "Reference":
-        """Nothing seen yet."""
+        """Statistics without any cycle."""
         return cls(np.zeros(suspects), np.zeros(suspects), np.zeros(suspects))
 
     def standard(self, scores: Floats) -> Floats:
-        """Scores as standard normal values, if their distribution is that of the scores before.
+        """Scores as standard normal values by the distribution of the scores before.
 
-        NaN also while too few are known.
+        NaN also while too few scores are known.
         """
         is_known = (self.count >= 2.0) & (self.squares > 0.0)
         count = np.where(is_known, self.count, 2.0)
@@ -66,7 +66,7 @@ class Reference:
         return result
 
     def add(self, scores: Floats) -> None:
-        """Take a cycle in (Welford's method)."""
+        """Add the scores of a cycle (Welford's method)."""
         shown = np.isfinite(scores)
         self.count = self.count + shown
         off = np.where(shown, scores - self.mean, 0.0)
@@ -76,12 +76,12 @@ class Reference:
 
 @dataclass(frozen=True)
 class NormalScores:
-    """The scores of one cycle in the steps of their normalisation; NaN without a score."""
+    """The scores of one cycle after each step of their normalisation; NaN without a score."""
 
     standard: Floats  # standardised
     unskewed: Floats  # without skewness
-    before: Floats  # unskewed scores of the cycle before
-    normal: Floats  # without the correlation with that
+    before: Floats  # unskewed scores of the previous cycle
+    normal: Floats  # without the correlation with the previous cycle
 
 
 class ScoreNormalizer:
@@ -118,7 +118,7 @@ class ScoreNormalizer:
 
 
 def _unskewed(standard: Floats, skewness: Floats) -> Floats:
-    """Standard scores of this skewness as normal ones, taken for log-normal."""
+    """Standard scores of a given skewness as normal values, by a shifted log-normal."""
     skewness = np.clip(skewness, -SKEWED, SKEWED)
     sign, size = np.where(skewness < 0.0, -1.0, 1.0), np.maximum(np.abs(skewness), LEAST_SKEW)
     spread = size / 3.0 * (1.0 - size**2 / 27.0)  # sqrt(exp(s²) − 1), by its series in skewness
@@ -129,7 +129,7 @@ def _unskewed(standard: Floats, skewness: Floats) -> Floats:
 
 
 def as_normal(t: Floats, freedom: Floats) -> Floats:
-    """Student's t as the equally improbable standard normal value; NaN stays."""
+    """Student's t as the standard normal value of equal probability; NaN stays."""
     result: Floats = -np.sign(t) * np.maximum(ndtri(stdtr(freedom, -np.abs(t))), -FARTHEST)
     return result
 
@@ -139,7 +139,7 @@ class LearningGuard(Generic[T]):
 
     def __init__(self) -> None:
         self._waiting: list[T] = []
-        self._cycles = 0  # for which they still wait
+        self._cycles = 0  # cycles for which learning still pauses
 
     def take(self, cycle: T, normal: Floats) -> list[T]:
         """Take a cycle with its standard normal scores; give the cycles to learn now."""
@@ -153,7 +153,7 @@ class LearningGuard(Generic[T]):
         return ready
 
     def forget(self) -> None:
-        """Drop the waiting cycles: a change had begun."""
+        """Drop the waiting cycles, because a change had begun."""
         self._waiting, self._cycles = [], 0
 
 
@@ -167,23 +167,23 @@ class ChangeDetector:
         self._prior = often
         self._signs = np.stack(
             [np.ones(len(both_ways)), -1.0 * both_ways], axis=1
-        )  # 0: sign not possible
+        )  # 0 for an impossible sign
         self._shift = self._signs[:, :, None] * SIZES
         self._half = 0.5 * self._shift**2
         self.weigh(np.eye(len(both_ways)))
         self.begin()
 
     def weigh(self, cosines: Floats) -> None:
-        """Share the weights by the cosines between signatures; a row of zeros is not shown."""
+        """Share the weights by the cosines between signatures; zeros mark an unseen suspect."""
         shares = _weights(self._signs, self._prior, cosines)[:, :, None] * SHARES  # pyright: ignore[reportArgumentType]
         self._weight = np.log(shares + np.finfo(float).tiny)
 
     def begin(self) -> None:
-        """Forget everything."""
+        """Reset the statistics."""
         self._log = np.full(self._shift.shape, -np.inf)
 
     def begin_some(self, devices: npt.NDArray[np.bool_]) -> None:
-        """Forget everything of some devices, if scores of several are taken at once."""
+        """Reset the statistics of some devices, if scores of several are taken at once."""
         self._log[devices] = -np.inf
 
     def take(self, normal: Floats, most: float = MOST) -> None:

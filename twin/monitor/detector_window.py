@@ -1,4 +1,4 @@
-"""Window of the switching detector: how wide breakpoints need it, and how late they show."""
+"""Settings of the switching detector: the width of its window, and the delay of breakpoints."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -16,37 +16,37 @@ from twin.monitor.simulated_switching import bend_in_free_run, seen
 from twin.monitor.switching_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
 from twin.signals import MBAR, MS, Phase, Samples
 
-SHARP, ROUNDED = 2.5, 2.0  # wanted significance over SIGNIFICANT: of a sharp break, a rounded one
+SHARP, ROUNDED = 2.5, 2.0  # wanted significance over SIGNIFICANT, for a sharp and a rounded break
 ROUNDS = 8  # iterations of the window's rows
 LONGEST_WINDOW = 240  # rows
-NEVER = 2**31  # rows into a suction: no breakpoint is searched
+NEVER = 2**31  # rows from the start of a suction: no breakpoint is searched
 SETTLED = 20e-3  # s after the valve's response before the first breakpoint
-AGAIN = 30e-3  # s after a breakpoint before the next one: lines ring in that time
+AGAIN = 30e-3  # s from a breakpoint to the next search: lines ring in that time
 AT_ONCE = 2  # rows: smaller shifts are ignored; calibrated lag and shift would chase each other
-HELD = 2.0  # s for which the nozzle is off in the free run
-LONGEST_RUN = 60_000  # rows of it
+HELD = 2.0  # s that the nozzle stays off in the free run
+LONGEST_RUN = 60_000  # rows of a free run
 LEAST_BEND = 1e-3  # Pa per row
-LEAST_SUCTION = 0.02  # suction at H1 over that at half of it: less is next to nothing
-TOLD_LATE = 20e-3  # s, longest delay of an ejector's report: a slow IO-Link cycle and a PLC's
+LEAST_SUCTION = 0.02  # suction at H1 over that at half of H1: less counts as none
+TOLD_LATE = 20e-3  # s, longest delay of an ejector's report: a slow IO-Link and PLC cycle
 RINGS = 1.5  # highest ringing of a line over that of the free run
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
 
 def knees_of(data: DataSet, sampling_ms: float | None = None) -> Knees:
-    """Properties of breakpoints for a data set's unit, at its sampling or at that of a record."""
+    """Detector settings for a data set's unit, at its sampling or at ``sampling_ms``."""
     period = (sampling_ms or data.sensor.sampling_ms) * MS
     noise = data.sensor.noise_in_means(sampling_ms) * MBAR
     return expected_knees(coefficients(data), noise, period)
 
 
 def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
-    """Derive the window of breakpoints from the change of the slope at H1 in this system.
+    """Derive the detector's window from the change of the slope at H1 in this system.
 
     ``noise`` in Pa; rows come each ``period`` (s).
-    The slope of a straight line over n rows of noise s has the deviation s √(12/n³). The window is
-    chosen so that the break is SIGNIFICANT against the difference of two such slopes. A lag of the
-    sensor leaves 1 / (1 + lag / n) of that difference. Without air saving there are only the
-    breakpoints that the ejector reports.
+    The slope of a straight line over n rows of noise s has the standard deviation s √(12/n³). The
+    window is chosen so that the break is SIGNIFICANT against the difference of two such slopes. A
+    lag of the sensor leaves 1 / (1 + lag / n) of that difference. Without air saving there are
+    only the breakpoints that the ejector reports.
     """
     bend = _bend(theta, period)
     sharp = rows = (24.0 * (SHARP * SIGNIFICANT * noise / bend) ** 2) ** (1.0 / 3.0)
@@ -77,8 +77,8 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
 def _bend(theta: Theta, period: float) -> float:
     """Change of the slope (Pa per row) as the nozzle goes off at H1.
 
-    If next to nothing is sucked any more where the whole line is at H1, only the sensor's end of it
-    gets there: then a free run shows the change.
+    If suction is nearly zero with the whole line at H1, only the sensor's end of the line reaches
+    H1. Then a free run shows the change.
     """
     bend, half = (_slope(theta, share * float(theta[c.H1]), period) for share in (1.0, 0.5))
     if bend > LEAST_SUCTION * half:
@@ -89,15 +89,15 @@ def _bend(theta: Theta, period: float) -> float:
 
 
 def _slope(theta: Theta, vacuum: float, period: float) -> float:
-    """Fall of the pressure (Pa per row) by the ejector at a vacuum (Pa) in the whole line."""
+    """Fall of the pressure (Pa per row) by suction, with the whole line at a vacuum (Pa)."""
     suction = suction_at(theta, theta[c.AMBIENT] - vacuum) * R * theta[c.TEMPERATURE]
     return float(GAMMA * suction / (theta[c.VOLUME] + theta[c.PORT_VOLUME]) * period)
 
 
 def free_runs(theta: Theta, period: float) -> tuple[Theta, int]:
-    """Coefficients for a free run in which the nozzle goes on again, and rows of a free run.
+    """Coefficients for a free run in which the nozzle goes on again, and its number of rows.
 
-    In it there is a flow back, so that the vacuum falls to where the nozzle goes on.
+    A return flow lets the vacuum fall to where the nozzle goes on.
     """
     gas = (theta[c.VOLUME] + theta[c.PORT_VOLUME]) / (R * theta[c.TEMPERATURE])
     leaky = theta.copy()
@@ -109,7 +109,7 @@ def free_runs(theta: Theta, period: float) -> tuple[Theta, int]:
 
 
 def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
-    """``knees`` with delays and distance as in free runs.
+    """``knees`` with the delays and the least distance of free runs.
 
     Jet and sensor delay a breakpoint; the step at the port advances it. While that step oscillates
     in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
@@ -124,7 +124,7 @@ def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
     if tight.rings == 0.0 and knees.settled != NEVER and swing_rows > knees.window:
         knees = replace(knees, window=swing_rows, longest=max(knees.longest, swing_rows))
         tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
-    most_rows = knees.on_shift + knees.window  # a later one is another breakpoint
+    most_rows = knees.on_shift + knees.window  # later, it is another breakpoint
     if AT_ONCE < tight.off_rows <= most_rows:
         knees = replace(knees, off_shift=tight.off_rows)
     if 0 < leaking.on_rows <= most_rows:
@@ -136,10 +136,10 @@ def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
 
 
 def as_wide_as_needed(knees: Knees, blocks: Iterable[Samples]) -> Knees:
-    """``knees`` with the window in which most suctions of a record show the nozzle go off.
+    """``knees`` with the narrowest window that sees the nozzle go off in most suctions of a record.
 
-    The narrowest such window. A wider one finds breakpoints that an unexpectedly slow sensor has
-    rounded, but it lags more and needs longer stretches. ``blocks`` are read again for each window.
+    A wider window finds breakpoints that an unexpectedly slow sensor has rounded. But it lags more
+    and needs longer stretches. ``blocks`` are read again for each window.
     """
     if knees.settled == NEVER:
         return knees
@@ -154,13 +154,13 @@ def as_wide_as_needed(knees: Knees, blocks: Iterable[Samples]) -> Knees:
 
 
 def _count_nozzle_off(knees: Knees, blocks: Iterable[Samples]) -> tuple[int, int]:
-    """Number of suctions in which the nozzle is seen to go off, and of all suctions."""
+    """Number of suctions in which the detector sees the nozzle go off, and of all suctions."""
     suctions, nozzle_off, last_off, was_inside = 0, 0, 0, False
     for phase in _phases(PhaseFinder(knees), blocks):
         inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
         number = suctions + np.cumsum(np.diff(inside, prepend=was_inside) & inside)
         with_hold = np.unique(number[phase == Phase.HOLD])
-        if len(with_hold):  # a suction may go on from the block before
+        if len(with_hold):  # a suction may continue from the block before
             nozzle_off += len(with_hold) - int(with_hold[0] == last_off)
             last_off = int(with_hold[-1])
         if len(phase):

@@ -1,4 +1,4 @@
-"""What healthy cycles of one unit are like: a calibration learns it and stores it with the data."""
+"""Distribution of a unit's healthy cycles: a calibration learns it and stores it with the data."""
 
 import math
 from collections.abc import Mapping
@@ -8,36 +8,36 @@ from pydantic import Field, model_validator
 
 from twin.settings import Settings
 
-MEETS_MS = 3.0  # one sigma of when cups come upon a part, unless it was learned. Chosen
-UNSEEN_LEVEL_MBAR = 3.0  # one sigma of a switching level that no cycle shows and somebody told
-SURE = 0.9  # that a scatter is no larger than is told of it
+MEETS_MS = 3.0  # sigma of the time at which cups meet the part, unless learned. Chosen
+UNSEEN_LEVEL_MBAR = 3.0  # sigma of a switching level that a person entered and no cycle shows
+SURE = 0.9  # probability that a scatter is not larger than its stored sigma
 NOT_COMMISSIONED = "not commissioned: causes are not named"
 
 
 class Scatter(Settings):
-    """What one figure was in some healthy cycles: its mean, and how it scatters; in its unit."""
+    """Mean and scatter of one figure in some healthy cycles, in the figure's unit."""
 
     mean: float
-    sigma: float = Field(gt=0.0)  # one standard deviation, which is SURE not to be exceeded
-    cycles: int = Field(12, ge=2)  # that showed it
+    sigma: float = Field(gt=0.0)  # upper limit of the standard deviation, with confidence SURE
+    cycles: int = Field(12, ge=2)  # number of cycles that showed the figure
 
     @property
     def estimate(self) -> float:
-        """One standard deviation as these cycles had it."""
+        """Standard deviation in these cycles."""
         return self.sigma / sure(self.cycles)
 
 
 def sure(cycles: int) -> float:
-    """How many times its estimate from so many cycles a sigma may be, with SURE."""
-    from scipy.special import chdtri  # noqa: PLC0415 - SciPy would come with each configuration
+    """Upper limit of a sigma over its estimate from so many cycles, with confidence SURE."""
+    from scipy.special import chdtri  # noqa: PLC0415 - else each configuration loads SciPy
 
     return math.sqrt((cycles - 1) / float(chdtri(cycles - 1, SURE)))
 
 
 class ModelError(Settings):
-    """How far the calibrated model is off in healthy cycles, over time since a switching.
+    """Error of the calibrated model in healthy cycles, over the time since a switching.
 
-    One value per knot: as much in all cycles alike, and differently from cycle to cycle.
+    One sigma per knot (mbar): of an error common to all cycles, and of each cycle's own error.
     """
 
     after_ms: tuple[float, ...]
@@ -52,21 +52,21 @@ class ModelError(Settings):
 
 
 class Healthy(Settings):
-    """What healthy cycles are like.
+    """Distribution of healthy cycles.
 
-    ``figures`` of a cycle; the model's ``error`` by kind of stretch; what differs from cycle to
-    cycle (``scatter``: effect to one sigma of its size); in which ways the data set is
-    ``uncertain`` (the lower Cholesky factor of its covariance, a row for each value).
-    ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows, and
-    ``meets_ms`` of the time at which cups come upon the part, if that is after suction began.
-    ``rounding_mbar`` is one sigma of what rounding leaves in a mean of many readings.
+    ``figures`` are the mean and scatter of each figure. ``error`` is the model's error by kind of
+    stretch. ``scatter`` maps an effect to one sigma of its size from cycle to cycle. ``uncertain``
+    is the lower Cholesky factor of the data set's covariance, a row for each value.
+    ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows.
+    ``meets_ms`` is one sigma of the time at which cups meet the part, if that is after suction
+    began. ``rounding_mbar`` is one sigma of the rounding error in a mean of many readings.
     ``key_figures`` are those that have limits, in their own units.
     """
 
     figures: Mapping[str, Scatter] = Field(default_factory=dict)
     error: Mapping[str, ModelError] = Field(default_factory=dict)
     scatter: Mapping[str, float] = Field(default_factory=dict)
-    leftover: float = Field(1.0, gt=0.0)  # sigmas, by all this, that healthy cycles have
+    leftover: float = Field(1.0, gt=0.0)  # reduced chi of healthy cycles by this distribution
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
     unseen_level_mbar: float = Field(UNSEEN_LEVEL_MBAR, gt=0.0)
     meets_ms: float = Field(MEETS_MS, gt=0.0)

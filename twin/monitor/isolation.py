@@ -1,11 +1,11 @@
-"""Which cause it is, while the loop runs: probabilities of every effect, and of none, per cycle.
+"""Fault isolation while the loop runs: the probability of every effect, and of none, per cycle.
 
-That anything differs is judged by sums over cycles (``change_detection``). Which effect it is, by
-the mean of the cycles since it began, less what was usual before: each suspect is fitted to it
-alone, and its likelihood tells how probable it is. The first of these cycles is left out: the
-change may have begun inside of it, and a part of one effect looks like the whole of another.
-Cycle-to-cycle scatter averages out of that mean; what the model has wrong about a signature does
-not, so a share of what is explained counts as error.
+Sums over cycles detect that anything has changed (``change_detection``). The effect is isolated
+from the mean deviation of the cycles since the change, less the usual mean before it. Each suspect
+is fitted to that difference alone, and its likelihood gives its probability. The first of these
+cycles is left out: the change may have begun within it, and a part of one effect looks like the
+whole of another. Scatter from cycle to cycle averages out of the mean. An error of the modelled
+signature does not, so a share of the explained deviation counts as error.
 """
 
 import math
@@ -44,41 +44,41 @@ from twin.monitor.statistics import CycleResidual, ScoreExtractor
 from twin.monitor.surroundings import told
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
-KEPT = 400  # cycles whose scores are remembered: a change is not sought further back
-RECENT = 60  # of them, the last ones that are remembered whole: from them a cause is named
-LEARNED = 10  # cycles before which nothing is said
-SHOWN = 3.0  # sigmas: less by the cycles after the first, and it is not asked what differs
-DOUBTED = 0.05  # probability that anything differs, from which on it is asked what
-RETURNED = float(np.log(1000.0))  # of the odds that it is as before, for it to be over
-DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # sizes of delays that are looked at
-FEWEST_BACK = 3  # cycles to be sure of that, however far it was
+KEPT = 400  # cycles whose scores are kept: an earlier change is not searched
+RECENT = 60  # last cycles whose deviations are kept as well: the cause is isolated from them
+LEARNED = 10  # cycles to learn from before the first verdict
+SHOWN = 3.0  # sigmas of a change in the cycles after its first; below it no cause is searched
+DOUBTED = 0.05  # probability of any change, from which a cause is searched
+RETURNED = float(np.log(1000.0))  # log odds of a healthy unit at which a change has ended
+DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of a delay, in steps
+FEWEST_BACK = 3  # least cycles until a change counts as ended, however large it was
 
 
 class Heard(NamedTuple):
-    """What a cycle that is fit to be judged says."""
+    """Residual and scores of a cycle that can be evaluated."""
 
     said: CycleResidual
     scores: Floats
-    seconds: float  # how long it was
+    seconds: float  # duration of the cycle
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is held of the causes after a cycle."""
+    """Probabilities of the causes after a cycle."""
 
-    none: float  # probability that nothing differs
-    causes: Sequence[Likeness]  # the most probable first, by share; empty while nothing is doubted
-    raised: bool = False  # with this cycle it is beyond the limit
-    since: int = 0  # cycles that differ
-    sigmas: float = 0.0  # by which a cycle differs, in what is foremost
+    none: float  # probability that nothing has changed
+    causes: Sequence[Likeness]  # the most probable first; empty while a change is improbable
+    raised: bool = False  # the statistic exceeded its limit in this cycle
+    since: int = 0  # cycles since the change
+    sigmas: float = 0.0  # size of the change per cycle, in the foremost suspect
 
     def unnamed(self) -> "Verdict":
-        """The same without names: what differs is one unknown cause."""
+        """The verdict without names: one unknown cause has all the probability of a change."""
         share = sum(cause.share for cause in self.causes)
         return replace(self, causes=[Likeness(UNKNOWN, None, "", share)] if self.causes else ())
 
     def where_changed(self) -> "Verdict":
-        """The same where it is known that something differs."""
+        """The verdict given that something has changed."""
         total = sum(cause.share for cause in self.causes) or 1.0
         return replace(
             self,
@@ -87,7 +87,7 @@ class Verdict:
         )
 
     def plain(self) -> dict[str, float]:
-        """The probabilities, of what has at least one in a hundred."""
+        """Probabilities by cause, of those with at least 0.01."""
         shown = {cause.effect: round(cause.share, 3) for cause in self.causes}
         likely = {effect: share for effect, share in shown.items() if share >= 0.01}
         return {"none": round(self.none, 3), **likely}
@@ -95,25 +95,25 @@ class Verdict:
 
 @dataclass
 class _Usual:
-    """Mean deviation at each place in the cycles so far."""
+    """Running mean of the deviation in each cell (kind of stretch, time) of the cycles so far."""
 
-    count: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))  # by place
+    count: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))  # by cell
     mean: Floats = field(default_factory=lambda: np.zeros(len(KINDS) << 16))
 
     def add(self, residual: CycleResidual) -> None:
-        at = residual.place  # levels, which are below zero, at the end
+        at = residual.place  # levels have negative numbers: they index from the end
         self.count[at] += 1.0
         self.mean[at] += (residual.off - self.mean[at]) / self.count[at]
 
     def of(self, residual: CycleResidual) -> tuple[Floats, Floats]:
-        """Mean (mbar) at the places of a cycle, and in how many cycles they were seen."""
+        """Mean (mbar) in the cells of a cycle, and the number of cycles that showed each."""
         return self.mean[residual.place], self.count[residual.place]
 
 
 class Isolation:
-    """Takes the rows of the twin and its cycles; gives what is held of the causes.
+    """Takes the rows of the twin and its cycles; gives the probabilities of the causes.
 
-    ``days`` between false alarms of any kind, for one ejector.
+    ``days`` is the mean time between false alarms of any kind, for one ejector.
     """
 
     def __init__(self, bank: ModelBank, listener: ScoreExtractor, days: float) -> None:
@@ -122,31 +122,31 @@ class Isolation:
         self._suspects, count = listener.suspects, len(listener.suspects)
         self._reference, self._usual = Reference.of(count), _Usual()
         self._normalizer = ScoreNormalizer(count)
-        self._learned = 0  # cycles
+        self._learned = 0  # number of learned cycles
         self._guard = LearningGuard[
             tuple[CycleResidual, Floats, NormalScores]
-        ]()  # with their scores
-        self._changes: ChangeDetector | None = None  # once it is known which suspects look alike
+        ]()  # residuals with their scores
+        self._changes: ChangeDetector | None = None  # from when the signatures' cosines are known
         self._kept: deque[CycleResidual] = deque(maxlen=RECENT)  # some 40 kB each
-        self._scored: deque[Floats] = deque(maxlen=KEPT)  # their normal scores, and of more cycles
+        self._scored: deque[Floats] = deque(maxlen=KEPT)  # normal scores, of more cycles
         self._cycles, self._seconds = 0, 0.0
         self._ambient_is_measured = False
-        self._raised: tuple[int, float] | None = None  # suspect, and sigmas a cycle
-        self._since = 0  # cycles since it began, while raised
-        self._back = 0.0  # logarithm of the odds that it is as before
-        self._alike = np.zeros((count, count))  # cosines, as far as known
+        self._raised: tuple[int, float] | None = None  # suspect, and size in sigmas per cycle
+        self._since = 0  # cycles since the change, while raised
+        self._back = 0.0  # log odds that the unit is healthy again
+        self._alike = np.zeros((count, count))  # cosines between signatures; 0 if unknown
         ends = [suspect.parameter.range(listener.theta) for suspect in self._suspects]
         steps = np.array([suspect.step for suspect in self._suspects])
         self._bounds = np.array(ends) / steps[:, None]
 
     @property
     def stands(self) -> bool:
-        """Whether it was beyond the limit, and has not come back since."""
+        """Whether the statistic exceeded its limit, and the unit is not healthy again."""
         return self._raised is not None
 
     @property
     def known(self) -> list[Effect]:
-        """The effects beside the table that are looked for."""
+        """Effects of the catalogue beside the table that are searched."""
         names = dict.fromkeys(
             suspect.effect for suspect in self._suspects if suspect.effect not in EFFECTS
         )
@@ -154,7 +154,7 @@ class Isolation:
 
     @property
     def heard(self) -> tuple[CycleResidual, Floats]:
-        """What the last cycle said, and its scores as standard normal variables."""
+        """Residual of the last cycle, and its scores as standard normal values."""
         return self._kept[-1], self._scored[-1]
 
     def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
@@ -163,7 +163,7 @@ class Isolation:
 
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
-        """The isolation beside the twin of a data set; compiled, not to fall into a block."""
+        """The isolation for a data set's twin; compiles all functions, so that no block waits."""
         listener = ScoreExtractor.of(data, healthy)
         first = ModelBank(listener.theta, listener.suspects)
         drawn, expected = first.take(
@@ -173,7 +173,7 @@ class Isolation:
         return cls(ModelBank(listener.theta, listener.suspects), listener, days)
 
     def hear(self, views: Sequence[CycleView]) -> list[Heard | None]:
-        """Take cycles and pieces, in order, and what the monitor has of them; say what they say."""
+        """Take views of cycles and pieces, in order; return scores, None if not comparable."""
         drawn = [self._bank.take(view.cycle) for view in views]
         self._ambient_is_measured = any("ambient" in told(view.cycle.samples) for view in views)
         residuals = [
@@ -188,10 +188,10 @@ class Isolation:
         ]
 
     def judge(self, heard: Heard, far: float = 0.0, *, begins: bool = False) -> Verdict | None:
-        """Say what is held after a cycle, the next one in order.
+        """Update the probabilities with the next cycle in order.
 
-        ``far`` are the sigmas by which it alone is out, if it is: from such a one nothing is
-        learned. Where something else ``begins`` with it, the cause is sought from it on.
+        ``far`` is the deviation (sigmas) of this cycle alone if its figures are out: such a cycle
+        is not learned. If another change ``begins`` with it, the cause is searched from it on.
         """
         residual, scores, seconds = heard
         self._cycles += 1
@@ -211,7 +211,7 @@ class Isolation:
         return verdict
 
     def _learn(self, residual: CycleResidual, scores: Floats, step: NormalScores) -> None:
-        """Take a cycle as usual; what is shown for the first time is looked for from now on."""
+        """Learn a healthy cycle; suspects that it is the first to show are searched from now on."""
         new = np.isfinite(scores) & (self._reference.count == 0.0)
         self._reference.add(scores)
         self._normalizer.learn(step)
@@ -231,7 +231,7 @@ class Isolation:
         changes.take(normal, FARTHEST if far else MOST)
         log_sum = changes.log_sum
         cycles = cycles_between(self.days, SUMS, self._seconds / self._cycles)
-        log_odds = log_sum - math.log(cycles)  # a fault is as rare as a false alarm
+        log_odds = log_sum - math.log(cycles)  # prior: a fault is as rare as a false alarm
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)
         if raised:
@@ -246,7 +246,7 @@ class Isolation:
         if self._raised is None and 1.0 - none < DOUBTED:
             return Verdict(none, ())
         if self._raised is not None and np.isnan(normal[self._raised[0]]):
-            return Verdict(none, ())  # this cycle does not show it
+            return Verdict(none, ())  # this cycle does not show the change
         since, sigmas = self._differ(changes)
         return Verdict(none, self._causes(changes, since, 1.0 - none), raised, since, sigmas)
 
@@ -256,7 +256,7 @@ class Isolation:
         self._back = 0.0
 
     def _is_back(self, normal: Floats) -> bool:
-        """Whether it is as before, by a likelihood ratio of its own."""
+        """Whether the unit is healthy again, by a likelihood ratio over the cycles since."""
         assert self._raised is not None
         suspect, sigmas = self._raised
         if np.isnan(normal[suspect]):
@@ -269,7 +269,7 @@ class Isolation:
         return True
 
     def _differ(self, changes: ChangeDetector) -> tuple[int, float]:
-        """How many of the last cycles differ, and by how many sigmas each."""
+        """Number of last cycles since the change, and its size in sigmas per cycle."""
         suspect, sign = changes.foremost()
         scores = self._scores(suspect)
         since = min(self._since, len(scores)) if self._raised else began(sign * scores)
@@ -277,20 +277,20 @@ class Isolation:
         return since, float(np.mean(shown)) if len(shown) else 0.0
 
     def _scores(self, suspect: int) -> Floats:
-        """Of the cycles that are kept."""
+        """Normal scores of one suspect in the kept cycles."""
         return np.array([float(normal[suspect]) for normal in self._scored])
 
     def _whole(self, changes: ChangeDetector, since: int) -> int:
-        """How many of the last cycles have it from their beginning; 0 if they do not show it."""
+        """Number of last cycles that lie wholly after the change; 0 if they do not show it."""
         whole = since - 1
         scores = self._scores(changes.foremost()[0])[-whole:] if whole else np.empty(0)
         shown = scores[np.isfinite(scores)]
         return whole if abs(shown.sum()) >= SHOWN * math.sqrt(max(len(shown), 1)) else 0
 
     def _causes(self, changes: ChangeDetector, since: int, changed: float) -> list[Likeness]:
-        """How probable each effect is, and one that nobody listed, which comes last.
+        """Probability of each effect, and of an unlisted cause, which comes last.
 
-        Together they are as probable as that something ``changed``.
+        They add up to the probability ``changed`` that something has changed.
         """
         whole = self._whole(changes, since)
         if not whole:
@@ -305,7 +305,7 @@ class Isolation:
             grows, most = _grows(number, signatures, larger), float(self._bounds[number, 1])
             sizes[number], left[number] = _fitted_along(off, grows, most)
         left += known.log_pdet
-        # What a low supply or weather does is not known well: in proportion to its size.
+        # The laws of a low supply and of weather are uncertain in proportion to their size.
         wider = {}
         for number in UNCERTAIN:
             ways = sizes[number] * mean.unsure[:, self._listener.variant_of == number]
@@ -343,7 +343,7 @@ class Isolation:
         return [*causes, Likeness(UNKNOWN, None, "", changed - listed)]
 
     def _mean(self, since: int) -> tuple[CycleResidual, Floats]:
-        """The mean of the last cycles, less what was usual; and its covariance."""
+        """Mean residual of the last cycles less the usual mean, and its covariance (mbar²)."""
         last = self._kept[-1]
         residuals = list(self._kept)[-since:]
         often = (
@@ -368,7 +368,7 @@ class Isolation:
         return replace(last, off=off, signatures=signatures, larger=larger), covariance
 
     def _by_effect(self, share: Floats, sizes: Floats) -> list[Likeness]:
-        """Parameters of one effect belong together; the most probable one gives the size."""
+        """Add the shares of an effect's parameters; the most probable one gives the size."""
         causes: dict[str, Likeness] = {}
         for number in np.argsort(-share).tolist():
             suspect, probability = self._suspects[number], float(share[number])
@@ -385,26 +385,26 @@ class Isolation:
 
 
 def looked_for(suspects: Sequence[Suspect] = SUSPECTS) -> ChangeDetector:
-    """Sums for all suspects, with nothing seen yet."""
+    """A change detector for all suspects, without any cycle."""
     both_ways = np.array([suspect.both_ways for suspect in suspects])
     return ChangeDetector(both_ways, np.array([suspect.often for suspect in suspects]))
 
 
 def _fitted(off: Floats, signatures: Floats, bounds: Floats) -> tuple[Floats, Floats]:
-    """Of each signature the size within bounds that fits best, and the squares that are left."""
+    """Best size of each signature within bounds, and the residual sum of squares."""
     power = np.maximum(np.sum(signatures**2, axis=0), 1e-12)
     sizes = np.clip(np.sum(signatures * off, axis=0) / power, *bounds.T)
     return sizes, np.sum((off - sizes * signatures) ** 2, axis=0)
 
 
 def _explains(known: Covariance, off: Floats, effect: Floats) -> bool:
-    """Whether an effect takes away most of what is ``off`` (mbar) beyond chance."""
+    """Whether an effect removes most of the significant part of the residual ``off`` (mbar)."""
     before, after = np.sum(known.white(np.column_stack([off, off - effect])) ** 2, axis=0)
     return bool(before - after >= EXPLAINED * (before - len(off)))
 
 
 def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Floats:
-    """What a suspect does at a size, in its steps."""
+    """Response (mbar per cell) to a suspect at a size, which is in its steps."""
     if number not in DELAYS:
         return signatures[:, number] * size
     grows = _grows(number, signatures, larger)
@@ -415,13 +415,13 @@ def _effect(number: int, size: float, signatures: Floats, larger: Floats) -> Flo
 
 
 def _grows(number: int, signatures: Floats, larger: Floats) -> Floats:
-    """What a delay does at each of DELAYS_AT, (places, sizes)."""
+    """Response (mbar) to a delay at each of DELAYS_AT, (cells, sizes)."""
     columns = np.split(larger, len(DELAYS), axis=1)[DELAYS.index(number)]
     return np.column_stack([np.zeros(len(columns)), signatures[:, number], columns])
 
 
 def _fitted_along(off: Floats, grows: Floats, most: float) -> tuple[float, float]:
-    """The same for what delays: from nothing on through its sizes, straight between them."""
+    """``_fitted`` for a delay: its response is interpolated linearly between the sizes."""
     at = DELAYS_AT
     wide, reach = np.diff(at), np.ones(len(DELAY_STEPS))
     reach[-1] = (most - at[-2]) / wide[-1]

@@ -18,14 +18,14 @@ class Likeness:
 
     @property
     def is_small(self) -> bool:
-        """Whether the response is nearly linear in the size: up to the typical size."""
+        """Whether the size is at most typical, so that the response is nearly linear in it."""
         effect = find_effect(self.effect)
         typical = effect.parameters[0].typical if effect else 0.0
         return self.size is not None and abs(self.size) <= typical
 
     @property
     def words(self) -> str:
-        """The effect and its size for people, or why there is none."""
+        """The effect and its size for people, or why it has none."""
         if self.effect == UNKNOWN:
             return UNNAMED
         if self.size is None:

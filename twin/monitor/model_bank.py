@@ -25,15 +25,15 @@ from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Str
 from twin.monitor.rows import time_steps
 from twin.signals import MS, NS, Phase, Samples, Ticks
 
-SWUNG_IN = 2  # cycles after which the models have forgotten their initial state
-STEP = 0.25  # of a parameter's typical size
-# A delay shifts steep edges. The response is linear only while the shift is shorter than the edge,
-# so delays have a smaller step, and larger sizes in addition.
+SWUNG_IN = 2  # cycles after which the initial state no longer matters
+STEP = 0.25  # size in the bank, over a parameter's typical size
+# The same for delays. A delay shifts steep edges; the response is linear only while the shift is
+# shorter than the edge. So delays have a smaller step, and further hypotheses with larger sizes.
 DELAY_STEPS = (0.05, 0.25, 1.5)
-# Prior weight of effects that nobody can mend: weather and set-up. It is small, so that finding the
-# others takes no longer.
+# Prior weight of effects that nobody can mend: weather and set-up. It is small, so that they hardly
+# delay the detection of the others.
 SELDOM = 0.2
-NO_PHASE = 255  # before the first row
+NO_PHASE = 255  # phase before the first row
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -80,32 +80,32 @@ SUSPECTS: Sequence[Suspect] = _suspects(EFFECTS.values())
 
 
 def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
-    """Suspects of the table of effects, then of the data set's own catalogue."""
+    """Suspects from the table of effects, then from the data set's own catalogue."""
     return (
         *SUSPECTS,
         *_suspects(suspect for suspect in effects_in(data.catalogue) if suspect.acts(theta)),
     )
 
 
-# Relative sigmas of how suction and end pressure follow the supply. These values are the type's,
-# since only one supply was measured; so the effect of a low supply is uncertain.
+# Relative sigmas of the coefficients by which suction and end pressure follow the supply. They are
+# the type's, since a unit was measured at one supply only; so the law of a low supply is uncertain.
 UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
-# So is that of another ambient pressure: it changes the ratio of the supply to it as well.
+# The law of another ambient pressure is uncertain too: it changes the ratio of supply to ambient.
 UNCERTAIN_LAWS = frozenset(
     effect.name for effect in EFFECTS.values() if {c.SUPPLY, c.AMBIENT} & effect.touches
 )
 UNCERTAIN = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.effect in UNCERTAIN_LAWS)
 DELAYS = tuple(i for i, suspect in enumerate(SUSPECTS) if suspect.delays)
-LARGER = len(DELAY_STEPS) - 1  # further sizes of a delay
-# A switching of the air saving shows a row later than it acts with a step of an effect on these
-# coefficients: time constants of the sensor, and of the jet while it grows.
+LARGER = len(DELAY_STEPS) - 1  # number of further sizes of a delay
+# Coefficients whose step delays a breakpoint by a row after the switching: time constants of the
+# sensor, and of the jet while it builds up.
 SEEN_LATER = {Phase.HOLD: {c.SLOW_SENSOR}, Phase.SUCTION: {c.SLOW_SENSOR, c.SLOW_RAMP_UP}}
 
 
 def hypotheses(theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> list[Theta]:
     """Coefficients: the unchanged data set, each suspect, and further hypotheses.
 
-    These are the larger sizes of delays, and the ``variants`` of uncertain laws.
+    Further hypotheses are the larger sizes of delays, and the ``variants`` of uncertain laws.
     """
     steps = [size / DELAY_STEPS[0] for size in DELAY_STEPS[1:]]
     larger = [SUSPECTS[number].of(theta, factor) for number in DELAYS for factor in steps]
@@ -123,7 +123,7 @@ def variants(theta: Theta) -> list[tuple[int, Theta]]:
 
 
 def ways(effect: str, theta: Theta, changed: Theta) -> list[Theta]:
-    """Coefficients ``changed`` by an effect, each off by one sigma of what its law leaves open.
+    """Coefficients ``changed`` by an effect, each with one uncertainty of its law at one sigma.
 
     Another ambient pressure changes the ratio of the supply to it, as a low supply does.
     """
@@ -143,8 +143,8 @@ class ModelBank:
     """Gives the expected pressures of each hypothesis in the twin's cycles.
 
     Signatures are smooth except where a phase or a stretch begins, so the bank steps over
-    subsampled rows (``bins.sparse``). If a cycle runs like a cached one, nothing is stepped: the
-    cached prediction is used, and the models take the state at its end.
+    subsampled rows (``bins.sparse``). For a cycle like a cached one, it uses the cached prediction
+    and the state at its end, and steps over nothing.
     """
 
     def __init__(self, theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> None:
@@ -152,12 +152,12 @@ class ModelBank:
         self._state = kernel.new_state(self._theta.shape[1])
         self._drawings = PredictionCache()
         self._last_ns: int | None = None  # PLC time of the newest row
-        self._phase = NO_PHASE  # and its phase
+        self._phase = NO_PHASE  # phase of the newest row
         self._since = 0  # rows from the last breakpoint to the newest row
         self._drawn_until_ns = 0  # PLC time of the newest subsampled row
-        self._clean_cycles = 0  # cycles in a row without an odd row
+        self._clean_cycles = 0  # successive cycles without an odd row
         self._stepped = 0  # rows of the next piece that were stepped over
-        self._expected = np.empty((0, self._theta.shape[1]))  # at its subsampled rows
+        self._expected = np.empty((0, self._theta.shape[1]))  # Pa, at their subsampled rows
 
     def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
         """Process the rows so far of the next piece, to spread the work.
@@ -173,8 +173,8 @@ class ModelBank:
     def take(self, cycle: Cycle) -> tuple[Ints, Floats]:
         """Subsampled rows of a cycle or piece, and expected pressures (Pa) there.
 
-        Pressures are (drawn, hypotheses). If the cycle runs like a cached one, they are those of
-        that cycle: only differences between hypotheses are then right.
+        Pressures are (subsampled rows, hypotheses). For a cycle like a cached one they are those of
+        the cached cycle: then only the differences between hypotheses are right.
         """
         samples, ticks = cycle.samples, cycle.ticks
         drawn, stretches, since = self._look(samples, ticks)
@@ -228,7 +228,7 @@ class ModelBank:
 def _analyse(
     samples: Samples, ticks: Ticks, dt: Floats, phase: int, since: int
 ) -> tuple[Ints, bool, Ints, Floats, int]:
-    """Subsampled rows, whether a row is odd, stretches between breakpoints, rows since the last.
+    """Subsampled rows, whether any row is odd, stretches, and rows since the last breakpoint.
 
     A stretch has its first row and its shape (``Stretches``). ``dt`` are the rows' ``time_steps``.
     ``phase`` is that of the row before; ``since`` counts rows from the last breakpoint to it.
@@ -260,7 +260,7 @@ def _analyse(
 
 
 def _phases(phase: Bytes, after: Bytes, count: int) -> Bytes:
-    """Phases (rows, hypotheses): a switching that shows a row late is moved a row earlier.
+    """Phases (rows, hypotheses), with late switchings (``SEEN_LATER``) moved a row earlier.
 
     ``after`` is the phase of the row after each.
     """

@@ -1,8 +1,9 @@
-"""Which cause a large deviation has: the probability of each effect in the size that it has there.
+"""Isolation of large deviations: the probability of each effect, fitted to a single cycle.
 
-What is small is named by the signatures that run along with the loop (``isolation``). What is large
-is not in proportion to them: here each effect is fitted to one cycle alone, by what it does in the
-size found. Covariance, alternative and priors are the same in both, and in the diagnosis.
+``isolation`` names small deviations by signatures that run along with the loop. The response to
+a large effect is not in proportion to its signature. So each effect is fitted here by the
+response at its fitted size. Covariance, alternative and priors are the same as in ``isolation``
+and in the diagnosis.
 """
 
 from collections.abc import Sequence
@@ -37,14 +38,14 @@ from twin.monitor.statistics import PER_UNIT
 from twin.monitor.surroundings import told
 from twin.signals import MBAR, MS, Samples, Ticks, deviation, sampling_ms
 
-STARTS = (1.0, 2.5, 6.0, 15.0)  # typical sizes in which a fit begins
-FINALISTS, ROUNDS = 8, 3  # effects that go on from the best of these, and for how many rounds
-NOTHING = 0.02  # mbar rms: what moves the pressure by less in its typical size is not seen in it
-NOISE = 1.0  # mbar, of a row. Chosen: what is named here is far larger
+STARTS = (1.0, 2.5, 6.0, 15.0)  # starting points of a fit, in typical sizes
+FINALISTS, ROUNDS = 8, 3  # number of effects that are refined, and rounds of it
+NOTHING = 0.02  # mbar rms: the cycle does not show an effect whose typical size does less
+NOISE = 1.0  # mbar, of a row. Chosen: deviations that are named here are far larger
 # Typical sizes of weather: 75 mbar. At one place air pressure differs by less, storms aside; a rig
 # that moved to another altitude has to be commissioned again.
 MOST_WEATHER = 5.0
-EXPLAINED = 0.5  # of the squares, that a name takes away at least: more than it leaves
+EXPLAINED = 0.5  # least share of the squares that a named effect removes
 
 
 def likenesses(
@@ -55,11 +56,11 @@ def likenesses(
     begin: int,
     catalogue: Sequence[Effect] = (),
 ) -> list[Likeness]:
-    """Rank the effects, also those of a ``catalogue`` beside the table, by how probable each is.
+    """Rank the effects, also those of a ``catalogue`` beside the table, by probability.
 
-    That is by the deviation from row ``begin`` on; the rows before it let the model swing in.
-    Something that nobody listed stands last. Empty where the best effect does not explain half of
-    what differs, where too many fit alike, or where nothing can be compared.
+    The deviation from row ``begin`` on counts; in the rows before it the model forgets its initial
+    state. The unlisted cause stands last. Empty if the best effect explains less than half of the
+    squares, if too many effects fit equally well, or if nothing can be compared.
     """
     effects = [*EFFECTS.values(), *catalogue]
     firsts = [effect.parameters[0] for effect in effects]
@@ -83,7 +84,7 @@ def likenesses(
     sizes = np.array([fit.x[0] for fit in fits])
     moved = expect.at(np.diag(sizes)).moves
     rest = np.array([cycle.squares(cycle.off - moves) for moves in moved.T])
-    # What a law leaves open must not do the explaining.
+    # The uncertainty of an effect's law must not do the explaining.
     left[rest > (1.0 - EXPLAINED) * cycle.squares(cycle.off)] = np.inf
     is_weather = np.array([effect.is_weather for effect in effects])
     left[is_weather & (np.abs(sizes) > MOST_WEATHER)] = np.inf
@@ -115,7 +116,7 @@ def likenesses(
 
 
 def compiled_for(cycle: Cycle) -> None:
-    """Compile what a ranking needs, so that the first alarm does not wait for it."""
+    """Compile the functions of a ranking, so that the first alarm does not wait for them."""
     rows = drawn_rows(cycle.samples, cycle.ticks)
     averaged(cycle.ticks["phase"], cycle.off, rows, np.zeros((len(rows), 1)), PER_UNIT)
 
@@ -130,11 +131,12 @@ def listed_share(
     *,
     ambient_is_measured: bool,
 ) -> float:
-    """Probability that a listed effect acts, where the best, ``cause``, does ``moves`` (mbar).
+    """Probability that a listed effect acts, given the response ``moves`` (mbar) of the best one.
 
-    The alternative is something that nobody listed. Of what is explained in each place it leaves a
-    share, smooth over the warped ``time`` of each ``kind`` of stretch. What is off elsewhere speaks
-    for neither: a steep edge that comes a row later leaves much beside every effect.
+    The best one is ``cause``. The alternative is an unlisted cause. It leaves a share of the
+    explained deviation in each cell, smooth over the warped ``time`` of each ``kind`` of stretch.
+    Residuals in other cells support neither: a steep edge that comes a row later leaves much
+    beside every effect.
     """
     courses = [np.zeros((len(kind), 0))]
     for number in np.unique(kind[kind >= 0]):
@@ -148,32 +150,32 @@ def listed_share(
 
 @dataclass(frozen=True)
 class _Cycle:
-    """What is compared of a cycle, place by place."""
+    """Residuals and responses of a cycle in each compared cell."""
 
     bins: Bins
-    first: Ints  # bins; what comes again counts once
-    off: Floats  # mbar, measured less expected
-    moves: Floats  # mbar by each change of the coefficients, (places, changes)
-    late: Floats  # mbar by a millisecond of the time of contact, (places, 0 or 1)
+    first: Ints  # bin of each cell; a repeated cell counts once
+    off: Floats  # mbar, measured less expected, by cell
+    moves: Floats  # mbar, response to each change of the coefficients, (cells, changes)
+    late: Floats  # mbar per millisecond of the time of contact, (cells, 0 or 1)
 
     @property
     def kind(self) -> Ints:
-        """Of stretch, at each place."""
+        """Kind of stretch of each cell."""
         return self.bins.kind[self.first]
 
     @property
     def time(self) -> Floats:
-        """Warped, since the stretch began."""
+        """Warped time since the stretch began, of each cell."""
         return self.bins.time[self.first]
 
     def squares(self, off: Floats) -> float:
-        """Sum (mbar²) over the rows of what is off at each place."""
+        """Sum of squares (mbar²) over the rows, given the residual of each cell."""
         return float(np.sum(self.bins.count[self.first] * off**2))
 
     def covariance(self, healthy: Healthy, effects: Sequence[Effect], typical: Floats) -> Floats:
-        """Covariance (mbar²): healthy cycles scatter, and waveforms are a little wrong.
+        """Covariance (mbar²) of the cells: scatter of healthy cycles and errors of waveforms.
 
-        ``moves`` are those of the ``typical`` size of each effect.
+        ``typical`` are the typical sizes of the effects, at which ``moves`` were computed.
         """
         common, alone = model_error(healthy.error, self.kind, self.time)
         scatter = np.array(
@@ -193,14 +195,14 @@ class _Cycle:
 
 @dataclass(frozen=True)
 class _Expected:
-    """What the model expects of a cycle with any size of each effect."""
+    """Simulates a cycle with any sizes of the effects."""
 
     theta: Theta
     effects: Sequence[Effect]
-    samples: Samples  # from before the cycle on
+    samples: Samples  # rows, from before the cycle
     ticks: Ticks
-    begin: int  # row of the cycle
-    drawn: Ints  # rows that suffice
+    begin: int  # first row of the cycle
+    drawn: Ints  # subsampled rows that are compared
 
     @classmethod
     def of(
@@ -210,11 +212,11 @@ class _Expected:
         return cls(theta, effects, samples, ticks, begin, drawn)
 
     def at(self, sizes: Floats) -> _Cycle:
-        """The cycle with sizes (effects, n), in typical ones; empty where nothing compares."""
+        """The cycle at ``sizes`` (effects, n), in typical sizes; empty if nothing compares."""
         return self._cycle(self._with(np.column_stack([np.zeros(len(sizes)), sizes])))
 
     def unsure(self, number: int, size: float) -> Floats:
-        """What its law leaves open of an effect in a size: mbar by one sigma each, (places, n)."""
+        """Response (mbar, (cells, n)) to one sigma of each uncertainty in an effect's law."""
         sizes = np.zeros((len(self.effects), 1))
         sizes[number] = size
         changed = self._with(sizes)[:, 0]
@@ -222,7 +224,7 @@ class _Expected:
         return self._cycle(np.stack([changed, *off_by_one_sigma], axis=1)).moves
 
     def _with(self, sizes: Floats) -> Floats:
-        """Coefficients with so many typical sizes of each effect, (effects, n)."""
+        """Coefficients with ``sizes`` (effects, n), in typical sizes."""
         changes = [
             (effect.name, {p.name: p.typical for p in effect.parameters if not p.shapes})
             for effect in self.effects
@@ -230,10 +232,10 @@ class _Expected:
         return coefficients_at(self.theta, changes, sizes)
 
     def _cycle(self, theta: Floats) -> _Cycle:
-        """The cycle by the first coefficients, and what the others move it by."""
+        """The cycle with the first column of coefficients, and the response to the others."""
         here = self.drawn >= self.begin
         expected = self._expected(theta)[here] / MBAR
-        expected = np.where(np.isfinite(expected), expected, expected[:, :1])  # it has no answer
+        expected = np.where(np.isfinite(expected), expected, expected[:, :1])  # solver failed
         off = deviation(self.samples, self.ticks)[self.begin :] / MBAR
         phase = self.ticks["phase"][self.begin :]
         drawn = self.drawn[here] - self.begin
@@ -244,11 +246,11 @@ class _Expected:
 
     @cached_property
     def _period(self) -> float:
-        """Seconds from row to row."""
+        """Time from row to row (s)."""
         return sampling_ms(self.samples) * MS
 
     def _expected(self, theta: Theta) -> Floats:
-        """Pressure (Pa) at the drawn rows, (rows, n); ``theta`` is (coefficients, n)."""
+        """Pressure (Pa) at the subsampled rows, (rows, n); ``theta`` is (coefficients, n)."""
         rows = self.drawn
         breaks = time_steps(self.samples)[rows] < 0.0
         dt = np.where(breaks, -1.0, elapsed(self.samples[rows]))
@@ -261,15 +263,15 @@ class _Expected:
 
 @dataclass
 class _SizeFit(Descent):
-    """A fit of the size of one effect, in typical ones."""
+    """A fit of the size of one effect, in typical sizes."""
 
     effect: int = 0
-    hoped: float = np.inf  # chi-square that the next size would have, were moves in proportion
+    hoped: float = np.inf  # chi-square of the next size, predicted by a linear response
 
     def begin(self, size: float, moves: Floats, off: Floats) -> None:
-        """Consider a size that moves the cycle by ``moves``; both are whitened.
+        """Consider a size with the response ``moves`` to the residual ``off``; both are whitened.
 
-        The best one so far is kept, and the next one is where the best proportion would lead.
+        The best size so far is kept. The next one is where a linear response would fit best.
         """
         chi2 = float(np.sum((off - moves) ** 2))
         if chi2 < self.chi2:
@@ -282,9 +284,9 @@ class _SizeFit(Descent):
 
 
 def _fitted(known: Covariance, off: Floats, bounds: Floats, expect: _Expected) -> list[_SizeFit]:
-    """Fit the size of each effect; the few that promise most are refined.
+    """Fit the size of each effect; the few with the best predicted fit are refined.
 
-    Fits begin in larger sizes as well: what is late by much overlaps little with a bit of it.
+    Fits start at larger sizes as well: a long delay overlaps little with a short one.
     """
     white_off = known.white(off[:, None])[:, 0]
     none = float(white_off @ white_off)
@@ -307,7 +309,7 @@ def _fitted(known: Covariance, off: Floats, bounds: Floats, expect: _Expected) -
 def _refit(
     fits: list[_SizeFit], number: int, covariance: Floats, off: Floats, expect: _Expected
 ) -> Covariance:
-    """Fit an effect again with what its law leaves open; give the covariance with that."""
+    """Refit an effect with the uncertainty of its law; return the covariance with it."""
     before = fits[number]
     wider = Covariance.of(covariance + low_rank(expect.unsure(number, float(before.x[0]))))
     fits[number] = _SizeFit(before.low, before.high, before.x, effect=number)
@@ -316,7 +318,7 @@ def _refit(
 
 
 def _refine(fits: Sequence[_SizeFit], known: Covariance, off: Floats, expect: _Expected) -> None:
-    """Go on with some fits for a few rounds."""
+    """Continue some fits for a few rounds."""
 
     def residuals(requests: Sequence[tuple[_SizeFit, Floats]]) -> Floats:
         sizes = np.zeros((len(expect.effects), len(requests)))

@@ -2,8 +2,8 @@
 
 A suction begins with the nozzle on: the pressure falls. The nozzle went off where the fall ends,
 for good or until the pressure turns again. It went on where a fall as slow as the first begins. No
-model of the system is needed, and it may have no air saving. The switching levels are similar in
-all suctions: a first pass learns them, and they decide doubtful cases in the second.
+model of the system is used; the system may lack air saving. The switching levels are similar in all
+suctions: a first pass learns them, and they decide doubtful cases in the second.
 
 If the ejector reports its nozzle, the report says how often it switched; the pressure says when.
 """
@@ -35,12 +35,12 @@ from twin.quality import UNUSABLE
 from twin.signals import MBAR, MS, NS, Phase, Reported, Samples
 
 LONGEST_GAP, GAP_ROWS = 20.0 * MS, 5.0  # without a reading; a longer gap splits a suction
-LEAST_VACUUM, LEAST_NOISE, LEAST_ROWS = 20.0 * MBAR, 10.0, 12  # less shows nothing
+LEAST_VACUUM, LEAST_NOISE, LEAST_ROWS = 20.0 * MBAR, 10.0, 12  # depth of a suction: Pa, noise, rows
 # Least height of a turn: sigmas of the smoothed pressure, and share of the vacuum.
 TURN, TURN_SHARE = 12.0, 0.015
-HALFWAY = 0.5  # of the vacuum; before it the nozzle does not go off
-RETURN = 0.25  # of the rise: a new fall must come as near to the level where the nozzle went off
-SPEED = 0.4  # least duration of a new fall over that of the first; a line that rings is faster
+HALFWAY = 0.5  # least share of the vacuum at which the nozzle goes off
+RETURN = 0.25  # of the rise: how near a new fall must come to the level where the nozzle went off
+SPEED = 0.4  # least duration of a new fall over that of the first; a ringing line is faster
 # Least rise over the hysteresis, if a slow fall follows or not; quantile of rises taken for it.
 LIKE_OTHERS, AS_OTHERS, MOST = 0.5, 0.8, 0.8
 # Levels between which a fall's scale is timed, as shares from its end: for the first fall of a
@@ -48,7 +48,7 @@ LIKE_OTHERS, AS_OTHERS, MOST = 0.5, 0.8, 0.8
 FIRST_FALL, LATER_FALL = (0.16, 0.06), (0.5, 0.2)
 NEAR_THE_END = 0.06, 0.15  # share of a fall, from its end, in which the nozzle goes off
 BINS = 32  # in a fall's scale
-BEFORE, AFTER = (0.25, 0.5, 1.0, 2.0), (1.0, 0.5, 0.25)  # windows: of the scale, and of that before
+BEFORE, AFTER = (0.25, 0.5, 1.0, 2.0), (1.0, 0.5, 0.25)  # windows: over the scale; over that before
 FALLING, RISING = 0.05, 0.1  # least slopes over the fall's: before the break, or after it
 ENDED = 0.35  # largest slope after the break, over that before it
 # Least break of the slope, over the fall's slope. It is lower if the break is clearer than CLEARLY
@@ -59,9 +59,9 @@ BREAKS, BREAKS_CLEARLY, BREAKS_AS_KNOWN, CLEARLY, RISES = 0.32, 0.2, 0.1, 100.0,
 CLEAR, CLEAR_AT_LEVEL, CLEAR_ALONE = 8.0, 5.0, 16.0
 OTHERS = 1.0 / 3.0  # share of the suctions that must show a switching for its level to be known
 SIGMAS_OF_LEVEL, SHARE_OF_LEVEL = 5.0, 0.02  # largest distance from it: sigmas, or of the vacuum
-SHARE_OF_USUAL = 0.08  # the same from that of a known unit, of which something may have changed
+SHARE_OF_USUAL = 0.08  # largest distance (of the vacuum) from a known unit's level: it may change
 # Longest time from a report to its switching in the pressure (a valve, and a slow IO-Link cycle);
-# share of the readings in suction that must have a report.
+# least share of readings in suction with a report.
 TOLD_WITHIN, MOST_TOLD = 50.0 * MS, 0.98
 ON_WITHIN, ON_WINDOW = 20.0 * MS, 40  # search about the turn; rows on either side for the slopes
 
@@ -117,7 +117,7 @@ def noise_of(samples: Samples, phase: npt.NDArray[np.uint8]) -> Noise:
 def switchings(
     samples: Samples, phase: npt.NDArray[np.uint8], noise: Noise, usual: float = np.nan
 ) -> list[Switching]:
-    """Find all switchings in ``samples``; ``phase`` of each row is by commands alone.
+    """Find all switchings in ``samples``; ``phase`` follows from commands alone.
 
     ``usual`` is the pressure (Pa) at which the nozzle of a known unit goes off.
     """
@@ -265,7 +265,7 @@ class _Suction:
         lowest = np.minimum.accumulate(smooth)
         restarts = [0]
         for number, high in enumerate(highs):
-            ends = number + 1 == len(lows)  # suction ends before the nozzle goes off
+            ends = number + 1 == len(lows)  # suction ends before the nozzle goes off again
             low = high + int(smooth[high:].argmin()) if ends else lows[number + 1]
             rise = float(smooth[high] - smooth[restarts[-1] : high].min())
             fall = float(smooth[high] - smooth[low])
@@ -328,7 +328,7 @@ class _Suction:
         if levels and np.isfinite(levels.off):
             tolerance = max(SIGMAS_OF_LEVEL * levels.sigma, SHARE_OF_LEVEL * depth)
             at_level = abs(best.level - levels.off) < tolerance
-        else:  # so far
+        else:  # no levels yet
             at_level = abs(best.level - self.usual) < SHARE_OF_USUAL * depth
         least = CLEAR_AT_LEVEL if at_level else CLEAR_ALONE if levels else CLEAR
         share = BREAKS_CLEARLY if best.clear >= CLEARLY else BREAKS
@@ -410,7 +410,7 @@ class _Fall(NamedTuple):
 
     first: int  # row
     last: int  # exclusive
-    begin: int  # rows after the first from which the nozzle may go off
+    begin: int  # rows after ``first`` from which the nozzle may go off
     scale: int  # rows
     slope: float  # Pa/s, mean of the fall over its scale
     depth: float  # Pa

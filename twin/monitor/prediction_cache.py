@@ -1,7 +1,7 @@
-"""Cache of predictions of cycles for later similar ones, which need not be stepped.
+"""Cache of predictions of cycles: a later similar cycle needs no stepping.
 
 A signature depends on the phases of a cycle, their durations, and the levels to which the model is
-set. If these hardly differ, it is the same, counted from the beginning of each phase.
+set. Cycles that hardly differ in these have the same signature, counted from the start of a phase.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ from twin.model import kernel
 from twin.monitor.bins import Floats, Ints
 from twin.signals import MBAR
 
-KEPT = 16  # predictions: a few programs with their jitter
-LONGER = 0.02  # largest relative difference of durations; signatures differ by about this share
-LONGER_MS = 6.0  # largest difference of a short duration
+KEPT = 16  # predictions in the cache: enough for a few programs with their jitter
+LONGER = 0.02  # largest relative difference of durations; signatures differ by about as much
+LONGER_MS = 6.0  # largest difference of short durations
 LEVEL = 3.0 * MBAR  # Pa, largest difference of a level
 
 
@@ -24,7 +24,7 @@ LEVEL = 3.0 * MBAR  # Pa, largest difference of a level
 class Stretches:
     """Stretches of a cycle, or of its rows so far: from one breakpoint to the next."""
 
-    first: Ints  # row of each
+    first: Ints  # first row of each
     phases: bytes
     # Rows and ms of PLC time from its first row to its last, and the level (Pa) to which the model
     # is set where it begins, 0 for none. (stretches, 3)
@@ -32,7 +32,7 @@ class Stretches:
 
     @cached_property
     def may_differ(self) -> Floats:
-        """Largest differences of a similar cycle, (stretches, 3)."""
+        """Largest differences of a similar cycle, in the units of ``how``, (stretches, 3)."""
         differ = np.maximum(LONGER * self.how, LONGER_MS)
         differ[:, 2] = LEVEL
         return differ
@@ -49,7 +49,7 @@ class Stretches:
         return bool((np.abs(difference) <= cached.may_differ[: len(difference)]).all())
 
     def far(self, cached: Sequence["Stretches"]) -> Floats:
-        """Distances of a whole cycle from known ones of the same phases; inf if not similar."""
+        """Distances of a whole cycle from cached ones with the same phases; inf if not similar."""
         deviation = np.abs(self.how - np.array([stretches.how for stretches in cached]))
         deviation /= np.array([stretches.may_differ for stretches in cached])
         distance: Floats = np.where(
@@ -63,12 +63,12 @@ class CachedPrediction:
     """Expected pressures of each hypothesis in a cycle, and the models' state at its end."""
 
     stretches: Stretches
-    drawn: Ints  # rows; the last of every stretch is one of them
+    drawn: Ints  # subsampled rows, with the last row of every stretch
     expected: Floats  # Pa, (drawn, hypotheses)
     state: kernel.State
 
     def at(self, stretches: Stretches, drawn: Ints) -> Floats:
-        """Expected pressure (Pa) at rows of another, similar cycle.
+        """Expected pressure (Pa) at the rows ``drawn`` of another, similar cycle.
 
         Rows count from the beginning of their stretch; after its end the last value is held.
         """
@@ -80,16 +80,16 @@ class CachedPrediction:
 
 
 class PredictionCache:
-    """The predictions that were used last."""
+    """The most recently used predictions."""
 
     def __init__(self) -> None:
-        self._kept: list[CachedPrediction] = []  # the last used comes last
+        self._kept: list[CachedPrediction] = []  # the most recently used one is last
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def add(self, drawing: CachedPrediction) -> None:
-        """Add a prediction; drop the one unused for longest."""
+        """Add a prediction; a full cache drops the least recently used one."""
         self._kept = [*self._kept, drawing][-KEPT:]
 
     def may_be(self, stretches: Stretches) -> bool:

@@ -29,38 +29,39 @@ SCATTERING: Mapping[str, Parameter] = dict(
         key=lambda scattering: (scattering[1].is_time, scattering[1].healthy_sigma),
     )
 )
-# The same: parameter, and sigma unless a better one was learned.
+# By effect: the parameter that scatters, and its sigma unless a better one was learned.
 SCATTER: Mapping[str, tuple[str, float]] = {
     name: (parameter.name, parameter.healthy_sigma) for name, parameter in SCATTERING.items()
 }
-KNEE_MBAR = 0.7  # sigma of the level found at a knee, to which the model is set
-FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # nothing known
-ON_THE_PART_S = 5e-3  # cups that meet the part sooner than this after suction began are on it
+KNEE_MBAR = 0.7  # sigma of the level at a breakpoint, to which the model is set
+FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # not learned
+ON_THE_PART_S = 5e-3  # s after suction began: cups that meet the part sooner were on it before
 SCAN_MS = 1.0  # cycle time of a PLC's fast task
-_HOLD = KINDS.index("hold")  # it begins with a knee, as AGAIN does
+_HOLD = KINDS.index("hold")  # begins with a breakpoint, as AGAIN does
 _ERRORS = ("common_mbar", "alone_mbar")
 
 
 def least_time_ms(period_ms: float) -> float:
-    """One sigma of the time of a command in rows so far apart: it is seen at the next one.
+    """One sigma (ms) of a command's time: a change shows only at the next row.
 
-    A PLC reads pressure and commands in one scan, of a millisecond; then its time is known.
+    ``period_ms`` is the time from row to row. A PLC reads pressure and commands in one scan of a
+    millisecond; then the time is exact.
     """
     return math.sqrt(max(period_ms**2 - SCAN_MS**2, 0.0) / 12.0)
 
 
 def comes_on_part(theta: Theta) -> bool:
-    """Whether cups meet the part after suction began: when, differs from cycle to cycle."""
+    """Whether the cups meet the part only after suction began, at a time that scatters."""
     return bool(theta[c.CONTACT] > ON_THE_PART_S)
 
 
 def by_contact(
     bins: Bins, rows: Ints, kept: Ints, expected: Floats, theta: Theta, period: float
 ) -> Floats:
-    """Changes of the bins ``rows`` (mbar) by a millisecond of the time of contact, (bins, 0 or 1).
+    """Response (mbar) of the bins ``rows`` to a contact 1 ms later, (bins, 0 or 1).
 
     ``expected`` (mbar) is the twin's pressure at the rows ``kept``; rows are ``period`` seconds
-    apart. What follows contact comes later as a whole, to first order.
+    apart. To first order, the curve after contact shifts as a whole.
     """
     if not comes_on_part(theta):
         return np.empty((len(rows), 0))
@@ -76,7 +77,7 @@ def by_contact(
 def model_error(
     errors: Mapping[str, ModelError], kind: Ints, time: Floats
 ) -> tuple[Floats, Floats]:
-    """The model's error in bins (mbar): common to all cycles, and differing between them.
+    """Two errors of the model in bins (mbar): common to all cycles, and of each cycle alone.
 
     ``kind`` are indices into KINDS; ``time`` is warped time since the stretch began.
     """
@@ -94,12 +95,12 @@ def model_error(
 
 @cache
 def _knots(after_ms: tuple[float, ...]) -> Floats:
-    """The times at which an error is given, warped."""
+    """Warped times of the knots of an error."""
     return warped(np.array(after_ms) * MS)
 
 
 def _worst_error(errors: Mapping[str, ModelError]) -> ModelError:
-    """The error for a kind of stretch that healthy cycles did not have: the largest of others."""
+    """Error for a kind of stretch that no healthy cycle had: the largest of the other kinds."""
     if not errors:
         return FIRST_ERROR
     worst = [max(max(getattr(error, key)) for error in errors.values()) for key in _ERRORS]
@@ -109,7 +110,7 @@ def _worst_error(errors: Mapping[str, ModelError]) -> ModelError:
 def lasting(bins: Bins, rows: Ints, alone: Floats) -> Floats:
     """Covariance (mbar²) between the bins ``rows`` of errors that persist for a while.
 
-    These are the model's error of each cycle, ``alone`` (mbar), and that of the level at a knee.
+    These are the model's error of each cycle, ``alone`` (mbar), and that of a breakpoint's level.
     """
     stretch, kind, time = bins.stretch[rows], bins.kind[rows], bins.time[rows]
     knee = KNEE_MBAR * ((kind == _HOLD) | (kind == AGAIN))
@@ -117,10 +118,10 @@ def lasting(bins: Bins, rows: Ints, alone: Floats) -> Floats:
 
 
 class Reading(NamedTuple):
-    """What readings are off by (mbar, one sigma)."""
+    """Errors of readings (mbar, one sigma)."""
 
-    noise: float  # of a row
-    rounding: float = 0.0  # of all readings of a stretch at one pressure
+    noise: float  # mbar, of a single row
+    rounding: float = 0.0  # mbar, common to all readings of a stretch at one pressure
 
 
 def from_cycle_to_cycle(
@@ -133,10 +134,11 @@ def from_cycle_to_cycle(
 ) -> Floats:
     """Covariance (mbar²) between the bins ``rows`` of all differences between cycles.
 
-    Errors of ``reading``, ``persistent`` errors (see ``lasting``), and scatter: ``moves`` are the
-    changes (mbar) of each bin by one sigma of each thing that scatters, (bins, scatters). They are
-    scaled to the ``leftover`` (sigmas) that healthy cycles have. Noise is measured: it may grow
-    with that, and does not shrink. Rounding is known; healthy cycles may hardly show it.
+    It sums errors of ``reading``, ``persistent`` errors (see ``lasting``) and scatter. ``moves``
+    is the response (mbar) of each bin to one sigma of each scattering quantity, (bins,
+    quantities). The sum is scaled by ``leftover``, the reduced chi of healthy cycles. Noise is
+    measured: that factor may enlarge it and does not reduce it. Rounding is known, and healthy
+    cycles may hardly show it: it is not scaled.
     """
     covariance = (low_rank(moves, bins.cycle[rows]) + persistent) * leftover**2
     if reading.rounding > 0.0:

@@ -20,18 +20,18 @@ from twin.monitor.switching_detector import Knees, PhaseFinder
 from twin.quality import BREAK, UNUSABLE
 from twin.signals import MBAR, NS, SL_MIN, Command, Phase, Reported, Samples
 
-PATIENCE = 2  # cycles in a row that must contradict, or agree again
-# Two sensors may differ by so much at rest: 1 % of a vacuum sensor's bar, as the data sheets of
-# compact ejectors have it, and 3 mbar of a barometer.
+PATIENCE = 2  # successive cycles that must contradict, or agree again
+# Permitted difference of two sensors at rest: 1 % of a vacuum sensor's bar, as in the data sheets
+# of compact ejectors, and 3 mbar of a barometer.
 APART = 13.0 * MBAR  # Pa
-THRESHOLD = 15.0 * MBAR  # Pa, the same for a switching point, which has another sensor
-WEATHER = 25.0 * MBAR  # Pa, variation of ambient pressure about that of the data set
-LATE_S = 0.025  # s, longest delay of a report: a slow IO-Link cycle and a PLC's
-FALLS = 0.03  # of the vacuum: a larger rise contradicts a nozzle that is off
-LEAST_FALL = 10.0 * MBAR  # Pa
+THRESHOLD = 15.0 * MBAR  # Pa, permitted difference of a switching point, which has its own sensor
+WEATHER = 25.0 * MBAR  # Pa, permitted difference of ambient pressure from the data set's
+LATE_S = 0.025  # s, longest delay of a report: a slow IO-Link cycle and a PLC cycle
+FALLS = 0.03  # share of the vacuum; a larger rise contradicts a nozzle that is off
+LEAST_FALL = 10.0 * MBAR  # Pa, least such rise
 REST_ROWS, FEWEST = 20, 5  # last rows of an idle; fewest usable readings
-DEEP = 100.0 * MBAR  # Pa, least fall of the pressure for a check of the flow
-# Bounds of the gas drawn off by the meter over that by the pressure. The gas cools as it expands,
+DEEP = 100.0 * MBAR  # Pa, least fall of the pressure for which the flow is checked
+# Bounds of the ratio of gas drawn off by the meter to that by the pressure. Expanding gas cools,
 # so the pressure may show up to 1.4 times too much; a leak adds gas to the meter.
 FLOW_RATIO = 0.5, 3.0
 
@@ -41,7 +41,7 @@ Rows = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A signal, by its tag, that the pressure contradicts: the difference, and what to do."""
+    """A signal, by its tag, that the pressure contradicts: the difference, and the action."""
 
     signal: str
     what: str
@@ -139,7 +139,7 @@ def _nozzle(view: _View) -> dict[str, Contradiction | None]:
 
 
 def _unreported(view: _View, on: Rows) -> dict[str, Contradiction | None]:
-    """Check for a nozzle that goes off by the pressure while it is reported on."""
+    """Check for a nozzle that is reported on although the pressure shows it off."""
     unreported = view.samples.copy()
     unreported["reported"], unreported["quality"] = 0, unreported["quality"] & ~np.uint8(BREAK)
     finder = PhaseFinder(view.knees)
@@ -159,7 +159,7 @@ def _unreported(view: _View, on: Rows) -> dict[str, Contradiction | None]:
 
 
 def _keeps_evacuating(view: _View, on: Rows) -> dict[str, Contradiction | None]:
-    """Check for a vacuum that keeps rising while the nozzle is reported off."""
+    """Check for a vacuum that keeps rising although the nozzle is reported off."""
     off = np.flatnonzero(view.suction & ~on)
     if not len(off):
         return {}
@@ -298,12 +298,12 @@ def _period(samples: Samples) -> float:
 
 @dataclass
 class ReportWatch:
-    """Turns cycles into events: a signal contradicts, or agrees again."""
+    """Turns cycles into events: a signal contradicts the pressure, or agrees again."""
 
     theta: Theta
     knees: Knees
-    _standing: dict[str, Contradiction] = field(default_factory=dict)  # reported
-    _opposing: dict[str, int] = field(default_factory=dict)  # cycles in a row against that
+    _standing: dict[str, Contradiction] = field(default_factory=dict)  # reported contradictions
+    _opposing: dict[str, int] = field(default_factory=dict)  # successive cycles against the report
 
     def take(self, cycle: Cycle) -> Iterator[Event]:
         """Check a cycle; an incomplete one is ignored."""

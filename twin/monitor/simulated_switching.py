@@ -1,7 +1,7 @@
-"""Simulated detection of the air saving's switching: free runs of the model, and their knees.
+"""Simulated detection of the air saving's switching: the detector applied to free runs.
 
-A knee is found where lines on either side of it meet. A slow sensor rounds it, so it shows later
-and at another level than it happened. The simulation has the same errors as the log.
+A breakpoint is found where the lines on either side of it meet. A slow sensor rounds it, so that it
+shows later and at another level than the switching. The simulation has the same errors as the log.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ from twin.monitor.offline_switching import switchings
 from twin.monitor.switching_detector import SHORTEST_WINDOW, Knees, PhaseFinder
 from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples
 
-IDLE_ROWS = 50  # before the cycle
-FALLS = 3.0  # times the noise: a reading falls back by more while a line rings
-COPIES = 4  # as breakpoints of a record are placed together
-LATEST = 100.0 * MS  # s, of a breakpoint after the valve's action
+IDLE_ROWS = 50  # idle rows before the cycle
+FALLS = 3.0  # times the noise; while a line rings, readings fall back by more
+COPIES = 4  # cycles of the simulated record: breakpoints of a record are aligned together
+LATEST = 100.0 * MS  # s, longest delay of a breakpoint after the valve's action
 Bytes = npt.NDArray[np.uint8]
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _RESPONSES = {Phase.HOLD: c.RESPONSE_OFF, Phase.SUCTION: c.RESPONSE}
@@ -32,11 +32,11 @@ _RESPONSES = {Phase.HOLD: c.RESPONSE_OFF, Phase.SUCTION: c.RESPONSE}
 
 @dataclass(frozen=True)
 class Seen:
-    """Vacuum (mbar) at which the nozzle was seen to go off and on; NaN if it did not switch.
+    """Vacuum (mbar) at which the detector saw the nozzle go off and on; NaN if it did not switch.
 
-    ``*_rows`` are rows from the valve's action until the knee shows. ``*_above`` is the level found
-    less the sensor's reading then (Pa). Both are 0 if it did not switch. ``rings`` is the height
-    (Pa) of the line's ringing above the reading as the valve closed; 0 without ringing.
+    ``*_rows`` are rows from the valve's action to the breakpoint. ``*_above`` is the breakpoint's
+    level less the reading at the valve's action (Pa). Both are 0 if it did not switch. ``rings`` is
+    the height (Pa) of the line's ringing above the reading as the valve closed; 0 without ringing.
     """
 
     off: float
@@ -49,19 +49,19 @@ class Seen:
     thresholds: tuple[float, float] = (
         np.nan,
         np.nan,
-    )  # mbar, readings at H1 and where it goes on again
+    )  # mbar of vacuum read at H1, and at the level where the nozzle goes on again
 
     @property
     def levels(self) -> tuple[float, float]:
-        """Vacuum (mbar) of either switching; the reading at the threshold if it did not switch."""
+        """Vacuum (mbar) of both switchings; the reading at the threshold if it did not switch."""
         off, on = self.thresholds
         return off if np.isnan(self.off) else self.off, on if np.isnan(self.on) else self.on
 
 
 def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
-    """Simulate suction for ``rows`` from rest with the model running free, and find its knees.
+    """Run the model free through ``rows`` of suction from rest, and detect its switchings.
 
-    The model has steps of a millisecond, as the control of an ejector; rows have the period of
+    The model steps by a millisecond, like the control of an ejector; rows have the period of
     ``knees``.
     """
     samples = _suction(rows, knees.period)
@@ -69,7 +69,7 @@ def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
 
 
 def shows_late(theta: Theta, rows: int, noise: Noise, name: Phase) -> float:
-    """Time (s) from the valve's action into ``name`` until a whole record shows it, if it does.
+    """Time (s) from the valve's action into ``name`` to its breakpoint in a whole record; or NaN.
 
     The record consists of copies of a free run for ``rows``, and is read as one with ``noise``.
     """
@@ -99,7 +99,7 @@ def bend_in_free_run(theta: Theta, rows: int, period: float) -> float:
 
 
 def _suction(rows: int, period: float) -> Samples:
-    """Rows of a suction from rest, without pressure."""
+    """Samples of a suction from rest, without pressure."""
     samples = np.zeros(IDLE_ROWS + rows, SAMPLE)
     samples["sequence"] = np.arange(len(samples))
     samples["time_ns"] = np.arange(len(samples)) * max(round(period / MS), 1) * 1_000_000
@@ -108,7 +108,7 @@ def _suction(rows: int, period: float) -> Samples:
 
 
 def _run(theta: Theta, rows: int, period: float) -> "_Run":
-    """A free run of the model in such rows."""
+    """Run the model free for ``rows`` of ``period`` seconds."""
     steps_per_row = max(round(period / MS), 1)
     commands = np.full((IDLE_ROWS + rows) * steps_per_row, Command.SUCTION, np.uint8)
     commands[: IDLE_ROWS * steps_per_row] = 0
@@ -126,7 +126,7 @@ class _Run(NamedTuple):
     period: float  # s, from row to row
 
     def rows(self, coefficient: int) -> int:
-        """A coefficient that is a time, in rows."""
+        """A time of the coefficients, in rows."""
         return round(float(self.theta[coefficient]) / self.period)
 
     def acts(self, name: Phase) -> float:

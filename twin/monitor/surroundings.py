@@ -1,8 +1,8 @@
 """Ambient pressure and temperature by a barometer and a thermometer; only this module follows them.
 
-A data set has their values at the calibration of its unit. Present values change the model's
-surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin follows them at
-each suction edge, the monitor cycle by cycle, a diagnosis log by log.
+A data set has their values at the calibration of its unit. Measured values change the model's
+surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin takes them over at
+each suction edge, the monitor at each cycle, a diagnosis once per log.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -23,7 +23,7 @@ COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
 
 @compiled
 def are_told(samples: Samples) -> bool:
-    """Whether any row has ambient pressure or temperature; nearly always none has."""
+    """Whether any row has a measured ambient pressure or temperature."""
     for row in range(len(samples)):
         if samples[row].ambient > 0.0 or samples[row].temperature > 0.0:
             return True
@@ -31,12 +31,12 @@ def are_told(samples: Samples) -> bool:
 
 
 def told(samples: Samples) -> dict[str, float]:
-    """Medians (Pa, K) of the measured surroundings, by column; unmeasured ones are left out."""
+    """Medians (Pa, K) of the measured surroundings by column; unmeasured columns are left out."""
     return medians_of([samples])
 
 
 def medians_of(blocks: Iterable[Samples]) -> dict[str, float]:
-    """The same for a stream, of which only what was measured is kept."""
+    """``told`` for a stream; only measured values are kept in memory."""
     values: dict[str, list[npt.NDArray[np.float32]]] = {column: [] for column, _ in COLUMNS}
     for samples in blocks:
         if are_told(samples):
@@ -47,12 +47,12 @@ def medians_of(blocks: Iterable[Samples]) -> dict[str, float]:
 
 
 def following(theta: Theta, samples: Samples) -> Theta:
-    """Coefficients with the surroundings that rows have measured; ``theta`` itself if none."""
+    """Coefficients with the surroundings measured in ``samples``; ``theta`` itself if none are."""
     return surrounded(theta, told(samples)) if are_told(samples) else theta
 
 
 def surrounded(theta: Theta, medians: Mapping[str, float]) -> Theta:
-    """Coefficients in surroundings as ``told`` gives them; ``theta`` itself if none are known."""
+    """Coefficients in surroundings from ``told``; ``theta`` itself if ``medians`` is empty."""
     if not medians:
         return theta
     theta = theta.copy()
@@ -64,7 +64,7 @@ def surrounded(theta: Theta, medians: Mapping[str, float]) -> Theta:
 def taken_in(data: DataSet, samples: Samples) -> DataSet:
     """A data set with the sampling of a record, and with its surroundings if measured.
 
-    Where rows repeat readings, it says how often there is a new one.
+    If rows repeat readings, its ``renewed_ms`` is set to the interval of new ones.
     """
     medians, ambient = told(samples), data.ambient
     if "ambient" in medians:

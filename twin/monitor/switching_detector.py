@@ -1,17 +1,17 @@
-"""Phases from commands and pressure, with the switchings of the air saving that nobody reports.
+"""Phases from commands and pressure, with switchings of the air saving that the PLC does not see.
 
-A compact ejector switches its nozzle off at H1 and on again below it by itself; the PLC does not
-see it. It shows as a breakpoint, or knee, in the pressure: the slope breaks. The finder fits a
-straight line on each side, so it lags behind the measurement where there may be a knee. The model
-steps only over rows whose phase is known, and is synchronised to the measured level at each knee.
-Rows that cannot be at a knee are given out at once.
+A compact ejector switches its nozzle off at H1 and on again below it by itself. The switching shows
+as a breakpoint in the pressure: its slope changes. The finder fits a straight line on each side, so
+its output lags behind the measurement where there may be a breakpoint. The model steps only over
+rows whose phase is known, and is synchronised to the measured level at each breakpoint. Rows that
+cannot be at a breakpoint are given out at once.
 
-If suction ends too soon after a switching, its knee does not show. Then the level decides: the
-nozzle went off where the pressure fell below that at which it went off before.
+If suction ends too soon after a switching, the breakpoint does not show. Then the level decides:
+the nozzle went off where the pressure fell below the level of the last switching.
 
-If the ejector reports its nozzle, knees are searched about its reports and nowhere else. If the
-pressure does not show a reported switching, it is placed where the valve must have acted. In a
-diagnosis, what the whole log shows takes the place of reports.
+If the ejector reports its nozzle, breakpoints are searched about its reports and nowhere else. If
+the pressure does not show a reported switching, it is placed where the valve must have acted. In a
+diagnosis, the switchings found in the whole log take the place of reports.
 """
 
 import math
@@ -30,24 +30,24 @@ from twin.signals import MBAR, MS, NS, SAMPLE, Phase, Reported, Samples, joined
 _Floats = npt.NDArray[np.float64]
 _Bytes = npt.NDArray[np.uint8]
 
-IDLE_ROWS = 20  # rows of idle that give the level before a cycle
+IDLE_ROWS = 20  # rows of idle whose mean is the level before a cycle
 FEWEST_IDLE_ROWS = 5
-SIGNIFICANT = 7.0  # sigmas of slope difference that make a knee
-JUMP = 8.0  # times the noise, from one row to the next: a larger change is no knee
-ALONE = 2.0  # a jump over the changes before and after it: a ringing line rises for longer
-BEYOND = 10.0 * MBAR  # Pa below a known level of switching; in a record it scatters by 2 mbar rms
+SIGNIFICANT = 7.0  # least sigmas of a breakpoint's change of slope
+JUMP = 8.0  # times the noise; a larger change from row to row is no breakpoint
+ALONE = 2.0  # least ratio of a jump to the changes beside it: a ringing line rises for longer
+BEYOND = 10.0 * MBAR  # Pa below the last switching level; in a record that scatters by 2 mbar rms
 SHORTEST_WINDOW = 8  # rows
-MOST_MISSING = 0.5  # of a line's rows
+MOST_MISSING = 0.5  # largest share of unusable rows in a line
 
 # Indices of the finder's state.
-# Ages are in rows; that of suction restarts at a knee, and is −1 while suction is not commanded.
-# The level of the last knee is NaN before the first of a suction.
+# Ages are in rows; that of suction restarts at a breakpoint, and is −1 without a suction command.
+# The level of the last breakpoint is NaN before the first one of a suction.
 _NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _KNEE_LEVEL = range(6)
 _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
-# In this suction: knees, rows since it began, reported switchings that are overdue, and the nozzle
-# as reported then (1 on, 0 off, -1 not yet).
+# In this suction: breakpoints, rows since it began, reported switchings that were overdue, and the
+# reported nozzle after these (1 on, 0 off, -1 none yet).
 _SWITCHED, _SINCE, _REPORTS, _SAID = range(9, 13)
-_OFF_LEVEL = 13  # pressure when the nozzle last went off, in whichever suction; NaN before
+_OFF_LEVEL = 13  # pressure when the nozzle last went off, in this or an earlier suction; or NaN
 _BEGINNING = (0.0, -1.0, 0.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, math.nan)
 _KNOWN, _ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
 _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
@@ -55,15 +55,15 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 @dataclass(frozen=True)
 class Knees:
-    """Properties of knees in this system: rows of the window, noise (Pa), rows from valve to knee.
+    """Settings of the detector: rows of the window, noise (Pa), delays from valve to breakpoint.
 
     Rows come each ``period`` (s). The nozzle's closing shows ``off_shift`` rows later, its opening
-    ``on_shift``. No knee is searched in the first ``settled`` rows of suction. The next knee is at
-    least ``again`` rows after the last one, and ``apart`` (Pa) from it. A window of more
-    than ``longest`` rows could take the approach of the end pressure for a knee. If the ejector
-    reports its nozzle, a knee is within ``about`` rows of the report, and the valve acts ``acts``
-    rows after it (closing, opening). In a free run the nozzle is seen to go off at ``goes_off``
-    (Pa), if it does.
+    ``on_shift``. No breakpoint is searched in the first ``settled`` rows of suction. The next
+    breakpoint is at least ``again`` rows after the last one, and ``apart`` (Pa) from it. A window
+    of more than ``longest`` rows could take the approach of the end pressure for a breakpoint. If
+    the ejector reports its nozzle, a breakpoint is within ``about`` rows of the report, and the
+    valve acts ``acts`` rows after it (closing, opening). In a free run the detector sees the nozzle
+    go off at ``goes_off`` (Pa); NaN if it does not.
     """
 
     window: int
@@ -82,7 +82,7 @@ class Knees:
 
     @property
     def settles(self) -> int:
-        """Rows that must follow a knee to show its whole peak."""
+        """Rows that must follow a breakpoint to show the whole peak of its significance."""
         return self.window + self.window // 2
 
     @property
@@ -159,7 +159,7 @@ def _bends_at(pressure: _Floats, first: int, jump: int, last: int, noise: float)
 def _break_at(
     pressure: _Floats, row: int, window: int, noise: float, nozzle_on: bool
 ) -> tuple[float, float]:
-    """Significance of the slope's break at ``row`` and the level there; 0 if it is no knee.
+    """Significance of the slope's break at ``row`` and the level there; 0 if it is no breakpoint.
 
     Nozzle going off: the pressure fell, and stops falling. Nozzle going on: it begins to fall.
     Slopes also differ across a jump (a loose sensor), so that is excluded.
@@ -167,7 +167,7 @@ def _break_at(
     sigma = noise * math.sqrt(12.0 / float(window + 1) ** 3)
     right, _ = _line(pressure, row, window + 1)
     may_follow = right > -3.0 * sigma if nozzle_on else right < -3.0 * sigma
-    if not may_follow:  # true for nearly all rows: the line before is not needed
+    if not may_follow:  # so for nearly all rows: saves the line before
         return 0.0, math.nan
     left, left_mean = _line(pressure, row - window, window + 1)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
@@ -176,7 +176,7 @@ def _break_at(
     else:
         significance = -significance
         is_knee = left > -3.0 * sigma
-    level = left_mean + left * window / 2.0  # by the line before, as the pressure after may ring
+    level = left_mean + left * window / 2.0  # by the line before: the pressure may ring after it
     if not is_knee or significance < SIGNIFICANT:
         return 0.0, level
     jump, height = _greatest_jump(pressure, row - window, row + window)
@@ -201,11 +201,11 @@ def _find(
     """Fill ``phase`` and ``level`` from ``first`` on; returns the first row that needs later ones.
 
     ``settings`` = window, noise, off shift, on shift, settled, again, apart, about, acts (2).
-    Window 0 searches no knees (at the end of a stretch, where the rows after are missing). A knee
+    Window 0 searches none (at the end of a stretch, where the rows after are missing). A breakpoint
     changes phases back by its shift.
     """
     window, settled = int(settings[0]), settings[4]
-    end = first  # of the rows with the same command
+    end = first  # first row after those with the same command
     for row in range(first, len(pressure)):
         if row == end:
             end = _end_of(commands, row)
@@ -242,7 +242,7 @@ def _find(
 
 @compiled
 def _rows_behind(may_bend: bool, is_told: bool, settings: _Floats) -> int:
-    """Rows with the same command that must be known behind a row before it is searched."""
+    """Rows with the same command that must follow a row before it is searched."""
     window = int(settings[0])
     if may_bend:
         return max(window, int(settings[7])) if is_told else window
@@ -271,7 +271,7 @@ def _end_of(commands: _Bytes, row: int) -> int:
 
 @compiled
 def _unsettled(state: _Floats, settings: _Floats) -> int:
-    """Number of searched rows that a knee may still change."""
+    """Number of searched rows that a later breakpoint may still change."""
     if state[_AGE] < 0.0 or settings[0] == 0.0:
         return 0
     reach = int(settings[2] if state[_NOZZLE] > 0.0 else settings[3])
@@ -296,7 +296,7 @@ def _idle(state: _Floats, pressure: _Floats, row: int, level: _Floats) -> None:
 
 @compiled
 def _idle_level(state: _Floats, pressure: _Floats, row: int) -> float:
-    """Pressure (Pa) at ``row`` by a line through the idle rows: a closed vessel may still cool."""
+    """Pressure (Pa) at ``row`` by a line through the idle rows: gas in a closed vessel may cool."""
     mean = state[_IDLE_SUM] / state[_IDLE_AGE]
     if state[_IDLE_AGE] < IDLE_ROWS or row < IDLE_ROWS:
         return mean
@@ -316,7 +316,7 @@ def _track_break(
     phase: _Bytes,
     level: _Floats,
 ) -> None:
-    """Track the break's significance over the rows, and set a knee at its peak."""
+    """Track the break's significance over the rows, and set a breakpoint at its peak."""
     window, noise, nozzle_on = int(settings[0]), settings[1], state[_NOZZLE] > 0.0
     significance, break_level = 0.0, 0.0
     if may_bend:
@@ -359,7 +359,7 @@ def _level_before(pressure: _Floats, row: int) -> float:
 def _decide_by_level(
     state: _Floats, pressure: _Floats, row: int, settings: _Floats, is_last: bool, phase: _Bytes
 ) -> None:
-    """At the last row of a suction, let the nozzle go off where a level says so.
+    """At the last row of a suction, decide by the pressure whether the nozzle went off.
 
     That is where the pressure fell below the one at which it went off before. If that was so long
     ago that the knee would show, the nozzle did not go off.

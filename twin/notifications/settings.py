@@ -42,7 +42,7 @@ class Outlet(Settings):
     """What every destination has: how much waits for it, and for how long."""
 
     most_waiting: int = Field(default=10_000, ge=100)  # messages; then the oldest are given up
-    longest_days: float = Field(default=30.0, gt=0.0)  # that a message waits
+    longest_days: float = Field(default=30.0, gt=0.0)  # longest time that a message waits
 
 
 class ValueSettings(Settings):
@@ -60,12 +60,13 @@ class MqttSettings(Outlet):
     user: str = ""  # name at the broker
     password: Secret | None = None
     unprotected: bool = False  # a password without tls beyond this machine all the same
-    # Of all topics.
+    # First level of all topics.
     prefix: str = Field(default="ejector-twin", pattern=r"^[^+#\x00/]+(/[^+#\x00/]+)*$")
     keepalive_s: int = Field(default=30, ge=5, le=3600)  # gone for 1.5 of it, the twin is offline
     cycles: bool = False  # the key figures of each cycle too
     values: ValueSettings | None = None  # and lowest, mean and highest vacuum of each period
-    keep_hours: float = Field(default=72.0, gt=0.0, le=8784.0)  # of both; the older ones go
+    # Longest time that cycles and values are kept.
+    keep_hours: float = Field(default=72.0, gt=0.0, le=8784.0)
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
@@ -85,7 +86,7 @@ class HttpSettings(Settings):
     """An address of HTTP, and what protects what goes there."""
 
     url: str | Secret = ""
-    # That go with each message, each a secret.
+    # Headers of each message; each value is a secret.
     headers: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")], Secret] = Field(default={})
     tls: ServerTls = ServerTls()
     unprotected: bool = False  # headers without https beyond this machine all the same
@@ -115,7 +116,7 @@ class HttpSettings(Settings):
 class WebhookSettings(HttpSettings, Outlet):
     """An address that takes JSON by POST; none while ``url`` is empty."""
 
-    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)  # of one answer
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)  # longest time for an answer
 
 
 class UploadSettings(HttpSettings):
@@ -156,9 +157,11 @@ class EmailSettings(Outlet):
     recipients: tuple[Address, ...] = ()  # addresses that get every alarm at any time
     # a code such as "de", of a catalogue in twin/locale
     language: str = Field(default="en", pattern=r"^[A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*$")
-    pause_min: float = Field(default=15.0, ge=0.0, le=1440.0)  # between two mails on one alarm
-    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)  # of each answer of the server
-    longest_days: float = Field(default=3.0, gt=0.0)  # that a mail waits
+    # Shortest time between two mails on one alarm.
+    pause_min: float = Field(default=15.0, ge=0.0, le=1440.0)
+    # Longest time for each answer of the server.
+    timeout_s: float = Field(default=10.0, gt=0.0, le=60.0)
+    longest_days: float = Field(default=3.0, gt=0.0)  # longest time that a mail waits
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:

@@ -103,14 +103,14 @@ def _labelled(name: str, text: str) -> str:
 
 
 def _clock(instant: datetime) -> str:
-    """Date, time and zone; a mail may be read much later, and elsewhere."""
+    """Date, time and zone, since a mail may be read much later and in another zone."""
     offset = instant.strftime("%z")
     local = instant.strftime(f"{tr(DATE)} {TIME}")
     return f"{local} (UTC{offset[:3]}:{offset[3:5]})"
 
 
 def _why(mail: Body) -> str:
-    """Why the person gets the mail."""
+    """The reason why the person gets the mail."""
     match mail["reason"]:
         case Reason.ESCALATED:
             return tr("You get this mail because nobody has acknowledged the alarm yet.")

@@ -1,4 +1,4 @@
-"""Rows of a log as bins of time, each with its lowest and highest values: no peak is lost.
+"""Rows of a log as bins of time, each with its lowest and highest values, so that no peak is lost.
 
 Times are those of the run's clock, in ns, as alarms have them; pressures are vacuum in mbar.
 """
@@ -35,7 +35,7 @@ _Times: TypeAlias = npt.NDArray[np.int64]
 
 
 def no_bins() -> Bins:
-    """No bin at all."""
+    """An empty array of bins."""
     return np.empty(0, BIN)
 
 
@@ -68,7 +68,7 @@ def _timed(bins: Bins, rows: npt.NDArray[np.void], phase: npt.NDArray[np.uint8])
 
 
 def wall_time(rows: npt.NDArray[np.void]) -> _Times:
-    """When each of n > 0 rows was measured, by the run's clock, in ns.
+    """Time of measurement (ns, the run's clock) of each of n > 0 rows.
 
     Rows arrive in blocks, so their times of receipt have steps. PLC time has none; it is moved by
     the shortest delay that was seen since PLC time began anew.
@@ -85,7 +85,7 @@ def wall_time(rows: npt.NDArray[np.void]) -> _Times:
 
 
 def merged(bins: Bins, width_ns: int) -> Bins:
-    """One bin for each period of ``width_ns`` in which there is something, in order of time."""
+    """One bin for each period of ``width_ns`` with rows, in order of time."""
     if not len(bins):
         return bins
     if (np.diff(bins["first_ns"]) < 0).any():

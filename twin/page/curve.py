@@ -1,6 +1,6 @@
 """The curve of an ejector for any range of time, small enough for a browser.
 
-It is made of the unit's logs, and of the live rows where no log has come to yet.
+It consists of the unit's logs, and of live rows that are later than these.
 """
 
 import math
@@ -27,7 +27,7 @@ Interval = tuple[int, int]  # ns
 
 @dataclass(frozen=True)
 class Curve:
-    """The columns of a curve with what is said about them."""
+    """The columns of a curve, and its coverage by logs."""
 
     columns: Bins
     width_ns: int
@@ -39,7 +39,7 @@ class Curve:
 
 
 class Curves:
-    """Makes the curves of one unit from what its runs have left in ``folder``."""
+    """Makes the curves of one unit from the data that its runs have stored in ``folder``."""
 
     def __init__(self, folder: Path, unit: tuple[str, str]) -> None:
         self._folder = folder
@@ -47,11 +47,11 @@ class Curves:
 
     @property
     def logged(self) -> bool:
-        """Whether a run has ever said where its logs lie."""
+        """Whether any run has stored the folder of its logs."""
         return bool(remembered(self._folder))
 
     def read(self, from_ns: int, to_ns: int, now_ns: int) -> Curve:
-        """The curve of a range of time; what is after ``now_ns`` is no gap."""
+        """The curve of a range of time; time after ``now_ns`` is no gap."""
         width_ns = column_width(to_ns - from_ns)
         recorded = self._recorded.read(from_ns, to_ns, min(width_ns, COARSEST_READ_NS))
         bins = self._with_live(recorded.bins, from_ns, to_ns)
@@ -84,7 +84,7 @@ def column_width(span_ns: int) -> int:
 
 
 def _phases(bins: Bins, width_ns: int) -> list[tuple[int, int, int]] | None:
-    """Each phase from its first row to that of the next one, or to a gap."""
+    """Each phase, from its first row to the first row of the next one or to a gap."""
     if not len(bins):
         return []
     is_gap = follows_gap(bins, max(width_ns, COARSEST_READ_NS // 2))
@@ -102,7 +102,7 @@ def _phases(bins: Bins, width_ns: int) -> list[tuple[int, int, int]] | None:
 
 
 def _gaps(columns: Bins, width_ns: int, from_ns: int, to_ns: int) -> list[Interval]:
-    """Where nothing was recorded, also at both ends; the widest ones if they are too many."""
+    """Intervals without records, also at both ends; only the widest ones if there are too many."""
     after = np.flatnonzero(follows_gap(columns, width_ns))
     begins, ends = columns["last_ns"][after - 1], columns["first_ns"][after]
     gaps = list(zip(begins.tolist(), ends.tolist(), strict=True))

@@ -49,8 +49,8 @@ from twin.quality import BREAK
 from twin.signals import MBAR
 
 MOST_EPISODES = 500
-MOST_POINTS = 600  # of a trend's cycles
-AHEAD = 0.25  # share of the record to extrapolate where no limit is reached
+MOST_POINTS = 600  # cycles in a trend
+AHEAD = 0.25  # extrapolation over the record's length if no limit is reached
 REPORT = re.compile(r"[0-9a-f]{32}")
 
 
@@ -77,7 +77,7 @@ class Ejector:
         self._unit = Unit(config.asset.type, config.asset.id)
         self._curves = Curves(self._folder, (self._unit.type, self._unit.id))
         self._asked: set[int] = set()  # numbers of requests made through this page
-        self._changes: set[int] = set()  # the same of changes of limits
+        self._changes: set[int] = set()  # numbers of changes of limits made through this page
 
     # --- status ---------------------------------------------------------------------------------
 
@@ -170,7 +170,7 @@ class Ejector:
     # --- limits ---------------------------------------------------------------------------------
 
     def limits(self) -> dict[str, Any]:
-        """The limits that people may change, with who has changed what."""
+        """The limits that people may change, with their changes and authors."""
         now = self._clock()
         with self._alarms() as store:
             changes = store.limit_changes(self._unit)
@@ -328,7 +328,7 @@ def _with_hint(error: TwinError) -> str:
 
 
 def _trend_curve(trend: Trend) -> dict[str, Any]:
-    """The trend with its band for drawing, extrapolated to where it may reach its limit."""
+    """The trend with its band for drawing, extrapolated to the time when it may reach its limit."""
     if trend.step is None and trend.line is None:
         return {}
     days, middle, half = trend.shape(trend.ahead(AHEAD))

@@ -8,7 +8,7 @@ from twin.alarms.requests import LimitChange
 from twin.instants import instant
 from twin.languages.texts import tr
 
-MOST_CHANGES = 200  # that are listed
+MOST_CHANGES = 200  # listed changes
 
 
 def limits_document(
@@ -70,7 +70,7 @@ def _change(change: LimitChange, now_ns: int) -> dict[str, Any]:
 
 
 def _words(change: LimitChange, limit: AdjustableLimit) -> str:
-    """What was changed: from and to once applied, before that what is wanted."""
+    """The change in words: from and to once applied, before that the requested value."""
     if change.is_applied:
         return tr(
             "changed from {old} to {new}",

@@ -1,9 +1,9 @@
-"""Which folders the logs of an ejector lie in: a run leaves word for the page."""
+"""The folders with logs of an ejector: each run stores its folder for the page."""
 
 from pathlib import Path
 
-NAME = "logs.txt"  # in the ejector's folder of the page: a folder a line, the newest last
-MOST = 20  # folders
+NAME = "logs.txt"  # in the ejector's page folder: one folder a line, the newest last
+MOST = 20  # folders that are kept
 
 
 def remember(folder: Path, logs: Path) -> None:
@@ -20,7 +20,7 @@ def remember(folder: Path, logs: Path) -> None:
 
 
 def remembered(folder: Path) -> list[Path]:
-    """All folders; none if no run has logged."""
+    """All stored folders; empty if no run has logged."""
     try:
         lines = (folder / NAME).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

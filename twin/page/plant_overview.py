@@ -38,7 +38,7 @@ Document = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Vacuum of one period in mbar; None where there was none."""
+    """Vacuum of one period in mbar; None without values."""
 
     time: float  # Unix seconds
     low: float | None
@@ -53,7 +53,7 @@ class Heard:
 
     unit: Unit
     status: str = ""  # online, offline, or empty before the first message
-    since: float | None = None  # None: it died at an unknown time
+    since: float | None = None  # None if the time of a loss is unknown
     seen: float = 0.0  # time of its last message
     told: float = 0.0  # time of its last message with values
     every_s: float = 0.0  # interval of messages with values
@@ -86,7 +86,7 @@ class PlantOverview:
         self._lock = threading.Lock()
         self._ejectors: dict[Unit, Heard] = {}
         self._failure, self._since = "not connected yet", clock()
-        self.not_understood = 0  # messages
+        self.not_understood = 0  # number of invalid messages
 
     # --- writing --------------------------------------------------------------------------------
 

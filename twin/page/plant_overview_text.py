@@ -29,7 +29,7 @@ from twin.page.ejector_status import (
 )
 from twin.page.plant_overview import COLUMNS, NOT_UNDERSTOOD, Document, Heard, Row
 
-KEY_FIGURES = ("t0", "leakage", "air")  # of the table
+KEY_FIGURES = ("t0", "leakage", "air")  # key figures in the table
 SPARK_POINTS = 60
 SPARK_ROWS = 300
 SILENT_S = 15.0  # longer than the interval of three messages with values

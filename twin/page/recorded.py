@@ -1,7 +1,7 @@
 """Rows of an ejector's logs for any range of time: found by their indexes, kept as bins.
 
-A request takes at most about ``BUDGET_S``. What it has not read by then the next one reads: bins
-that were made once are kept, the most recently used ones in at most ``MOST_KEPT`` bytes.
+A request takes at most about ``BUDGET_S``. The next request continues the reading. Bins are cached:
+the most recently used ones, in at most ``MOST_KEPT`` bytes.
 """
 
 import time
@@ -28,7 +28,7 @@ GROUP = 64  # chunks that are read together: 16 s of a run, which completes four
 MOST_KEPT = 48 << 20  # bytes of bins
 MOST_INDEXES = 40  # files; 1 MiB each for 64 MB of log
 MOST_ROWS = 200_000  # in memory at a time
-MARGIN_NS = 2_000_000_000  # a file or a chunk may have rows so long beside the time it states
+MARGIN_NS = 2_000_000_000  # longest time of rows outside the range that a file or chunk states
 
 _Key: TypeAlias = tuple[Path, int, int, int]
 _Found: TypeAlias = tuple[Bins, int]  # and the count of damaged chunks
@@ -36,16 +36,16 @@ _Found: TypeAlias = tuple[Bins, int]  # and the count of damaged chunks
 
 @dataclass(frozen=True)
 class Recorded:
-    """What logs have of a range of time."""
+    """Bins of a range of time from logs, and the progress of reading."""
 
     bins: Bins
-    share: float  # of what there is that has been read: below 1 there is more to come
+    share: float  # share of the logs that has been read; below 1 another request reads more
     damaged: int  # stretches that cannot be read
 
 
 @dataclass(frozen=True)
 class _LogHead:
-    """What does not change in a file of this ejector."""
+    """Constant facts of a log file of this ejector."""
 
     begin_ns: int
     ambient: float  # Pa
@@ -63,12 +63,12 @@ class _Group:
 
     @property
     def key(self) -> _Key:
-        """Of its content; the last group of a running log grows."""
+        """Key of its content; the last group of a running log grows."""
         return self.path, self.inode, self.number, len(self.places)
 
     @property
     def begins_log(self) -> bool:
-        """Whether a run began with it: what was before is another run's."""
+        """Whether a run began with this group, so that rows before it are another run's."""
         return self.number == 0 and place_of(self.path)[1] == 0
 
 
@@ -162,7 +162,7 @@ class RecordedRows:
     # --- rows -----------------------------------------------------------------------------------
 
     def _kept_bins(self, group: _Group, width_ns: int) -> _Found | None:
-        """What was made of a group before; None if it is not kept."""
+        """Cached bins of a group; None if there are none."""
         key = group.key, width_ns
         if key in self._kept:
             self._kept.move_to_end(key)

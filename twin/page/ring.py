@@ -1,4 +1,4 @@
-"""Live rows in a small file, from the loop to the page: one writer, many readers, no waiting.
+"""Live rows in a small file, from the loop to the page: one writer, many readers, without waiting.
 
 The file is a ring of ``ROW``. A row contains its number twice: the second one is written before its
 values, the first one after them. So a reader in between sees two different numbers and skips the
@@ -26,7 +26,7 @@ ROW = np.dtype(
     [
         ("number", "<i8"),
         ("time_ns", "<i8"),  # PLC time of its last sample
-        ("host_ns", "<i8"),  # when that was received
+        ("host_ns", "<i8"),  # host time of receiving that sample
         ("measured_low", "<f4"),  # Pa, absolute; NaN without a usable sample
         ("measured_high", "<f4"),
         ("expected_low", "<f4"),

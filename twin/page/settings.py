@@ -13,8 +13,8 @@ REPORTS = "reports"
 class PageSettings(Settings):
     """The page of one ejector."""
 
-    keep: bool = False  # twin run leaves live rows and reports of diagnoses for twin serve
-    folder: str = "page"  # from the configuration's folder; each ejector has one of its own in it
+    keep: bool = False  # twin run stores live rows and reports of diagnoses for twin serve
+    folder: str = "page"  # folder relative to the configuration's; each ejector has its own in it
 
 
 def folder_of(document: Document, asset: Asset) -> Path:

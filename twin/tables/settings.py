@@ -66,11 +66,12 @@ class ColumnSource(Settings):
     ``range = [0, -1000]`` (in ``unit``).
     """
 
-    name: str  # of the column in the file
-    unit: Unit | None = None  # of pressure, vacuum and supply
-    reference: Reference | None = None  # of pressure (absolute if not said) and supply (gauge)
+    name: str  # name of the column in the file
+    unit: Unit | None = None  # unit of a pressure, vacuum or supply
+    # Zero of a pressure (default absolute) or supply (default gauge).
+    reference: Reference | None = None
     scale: float = 1.0  # -1 turns the sign
-    offset: float = 0.0  # in unit
+    offset: float = 0.0  # offset in unit
     signal: tuple[float, float] | None = None  # two numbers of the file: mA, V or counts
     range: tuple[float, float] | None = None  # what these two are, in unit
 
@@ -136,8 +137,9 @@ class ImportSettings(Settings):
     gaps: Bad = Bad.REFUSE  # samples that are missing
     pressure_unit: Unit | None = None  # says that the unit of the pressure's column is right
     period_ms: float | None = Field(None, gt=0.0, le=60_000.0)  # else the median of the file's
-    time_zone: Zone | None = None  # of times without one, as Europe/Berlin
-    date_order: Literal["day", "month"] | None = None  # which comes first in 03/04/2026
-    encoding: Encoding | None = None  # of a CSV file; else as its bytes tell, and said
-    sheet: str = ""  # of an Excel file; else its first one
+    time_zone: Zone | None = None  # zone of times without one, such as Europe/Berlin
+    date_order: Literal["day", "month"] | None = None  # first number in 03/04/2026
+    # Encoding of a CSV file; by default guessed from its bytes, with a note.
+    encoding: Encoding | None = None
+    sheet: str = ""  # sheet of an Excel file; by default the first one
     no_blow_off: bool = False  # the ejector has none: suction ends by itself
