@@ -1,5 +1,6 @@
-"""The certificate by which the twin proves itself, wherever a connection is protected."""
+"""The certificate by which the twin proves itself, and which connections need protection."""
 
+import ipaddress
 from pathlib import Path
 from typing import Self
 
@@ -19,3 +20,11 @@ class OwnCertificate(Settings):
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate and key belong together")
         return self
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches ``host``, an address or a name."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name
+        return host == "localhost"

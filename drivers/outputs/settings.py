@@ -1,12 +1,12 @@
 """The ``[results]`` table: the OPC UA server of the twin's results, and access to it."""
 
-import ipaddress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
 from twin.settings import Settings
+from twin.tls import is_loopback
 from twin.users import UsersFile
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class ResultsSettings(Settings):
             raise ValueError(
                 "users need policies without None: a password is not sent in the clear"
             )
-        if "None" in self.policies and not _is_loopback(self.host) and not self.unprotected:
+        if "None" in self.policies and not is_loopback(self.host) and not self.unprotected:
             raise ValueError(
                 f'"{self.host}" is beyond this machine: set policies without None, or say '
                 "unprotected = true if everybody there may read"
@@ -48,10 +48,3 @@ class ResultsSettings(Settings):
         pki = None if self.certificates is None else folder / self.certificates
         users = None if self.users is None else folder / self.users
         return self.model_copy(update={"certificates": pki, "users": users})
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name
-        return host == "localhost"

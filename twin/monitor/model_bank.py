@@ -23,6 +23,7 @@ from twin.monitor.bins import Floats, Ints, sparse_rows
 from twin.monitor.cycles import Cycle
 from twin.monitor.prediction_cache import CachedPrediction, PredictionCache, Stretches
 from twin.monitor.rows import time_steps
+from twin.monitor.uncertain_data import SUPPLY_LAW
 from twin.signals import MS, NS, Phase, Samples, Ticks
 
 SWUNG_IN = 2  # cycles after which the initial state no longer matters
@@ -87,10 +88,8 @@ def suspects_of(data: DataSet, theta: Theta) -> Sequence[Suspect]:
     )
 
 
-# Relative sigmas of the coefficients by which suction and end pressure follow the supply. They are
-# the type's, since a unit was measured at one supply only; so the law of a low supply is uncertain.
-UNSURE = {c.END_SLOPE: 0.5, c.SUPPLY_CURVATURE: 0.5, c.SUPPLY_OPTIMUM: 0.03}
-# The law of another ambient pressure is uncertain too: it changes the ratio of supply to ambient.
+# Effects with an uncertain law (SUPPLY_LAW): a low supply, and another ambient pressure, which
+# changes the ratio of supply to ambient as well.
 UNCERTAIN_LAWS = frozenset(
     effect.name for effect in EFFECTS.values() if {c.SUPPLY, c.AMBIENT} & effect.touches
 )
@@ -130,7 +129,7 @@ def ways(effect: str, theta: Theta, changed: Theta) -> list[Theta]:
     if effect not in UNCERTAIN_LAWS:
         return []
     varied = []
-    for number, share in UNSURE.items():
+    for number, share in SUPPLY_LAW.values():
         other = changed.copy()
         other[number] *= 1.0 + share
         varied.append(other)

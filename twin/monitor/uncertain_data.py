@@ -15,8 +15,13 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.scatter_covariance import ON_THE_PART_S, comes_on_part
 from twin.signals import MS
 
-# One sigma, relative, of the type's values for how suction and end pressure follow the supply.
-SUPPLY_UNKNOWN = {"end_pressure_slope": 0.5, "curvature": 0.5, "optimum_bar": 0.03}
+# Values by which suction and end pressure follow the supply: coefficient and relative sigma. They
+# are the type's, since a unit is measured at one supply only.
+SUPPLY_LAW: Mapping[str, tuple[int, float]] = {
+    "end_pressure_slope": (c.END_SLOPE, 0.5),
+    "curvature": (c.SUPPLY_CURVATURE, 0.5),
+    "optimum_bar": (c.SUPPLY_OPTIMUM, 0.03),
+}
 # Share of a value's sigma by which a way must move it to tie it to others. Chosen: what a record
 # shows of a value, it shows of its neighbours as well; what it does not, stands alone.
 TIES = 0.3
@@ -35,9 +40,9 @@ class Shift(NamedTuple):
 def shifted(data: DataSet, healthy: Healthy) -> Iterator[Shift]:
     """Each independent uncertainty of the data set.
 
-    Those of calibration come with those of SUPPLY_UNKNOWN, since only one supply was measured.
+    Those of calibration come with those of SUPPLY_LAW, since only one supply was measured.
     """
-    for key, share in SUPPLY_UNKNOWN.items():
+    for key, (_, share) in SUPPLY_LAW.items():
         value = getattr(data.supply, key)
         yield Shift(*_both_sides(data, {f"supply.{key}": share * value}))
     rows = list(healthy.uncertain.items())
@@ -51,7 +56,7 @@ def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
     rows = list(healthy.uncertain.items())
     sigmas = rng.standard_normal(len(rows))
     changes = {name: float(np.dot(row, sigmas[: len(row)])) for name, row in rows}
-    for key, share in SUPPLY_UNKNOWN.items():
+    for key, (_, share) in SUPPLY_LAW.items():
         value = getattr(data.supply, key)
         changes[f"supply.{key}"] = share * value * float(rng.standard_normal())
     return scattered(coefficients(_changed(data, changes, 1.0)), healthy, rng)

@@ -1,6 +1,5 @@
 """The tables of the outlets: where alarms go, and what protects them on the way."""
 
-import ipaddress
 import ssl
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -12,7 +11,7 @@ from twin.errors import ConfigError
 from twin.notifications.people import Address, Person
 from twin.secret import Say, Secret, refuse_secrets
 from twin.settings import Document, Settings
-from twin.tls import OwnCertificate
+from twin.tls import OwnCertificate, is_loopback
 
 
 class ServerTls(OwnCertificate):
@@ -74,7 +73,7 @@ class MqttSettings(Outlet):
             return self
         if not self.user:
             raise ValueError("a password needs a user")
-        if self.tls is None and not self.unprotected and not _is_loopback(self.host):
+        if self.tls is None and not self.unprotected and not is_loopback(self.host):
             raise ValueError(
                 f'"{self.host}" is beyond this machine, and a password is not sent in the clear:'
                 " give [mqtt.tls] (may be empty), or say unprotected = true"
@@ -169,7 +168,7 @@ class EmailSettings(Outlet):
             raise ValueError("needs a sender, the address that the mails come from")
         if (self.password is None) != (not self.user):
             raise ValueError("user and password belong together")
-        in_the_clear = self.encryption == "none" and not _is_loopback(self.host)
+        in_the_clear = self.encryption == "none" and not is_loopback(self.host)
         if self.password is not None and in_the_clear and not self.unprotected:
             raise ValueError(
                 f'"{self.host}" is beyond this machine, and a password is not sent in the clear:'
@@ -251,15 +250,8 @@ def _check_url(url: str, *, has_secrets: bool) -> None:
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise ValueError("url is no address: https://HOST/PATH")
-    if has_secrets and parts.scheme == "http" and not _is_loopback(parts.hostname):
+    if has_secrets and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise ValueError(
             f'"{parts.hostname}" is beyond this machine, and headers are secrets: take https,'
             " or say unprotected = true"
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name
-        return host == "localhost"

@@ -1,7 +1,6 @@
 """The web server of the page: its address, and limits for clients."""
 
 import asyncio
-import ipaddress
 import socket
 import ssl
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from twin.errors import ConfigError, SourceError
+from twin.tls import is_loopback
 
 MOST_AT_ONCE = 200  # connections
 HEAD_S = 10.0  # limit for the head of a request to arrive
@@ -31,10 +31,7 @@ class Place:
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine reaches it."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_loopback(self.host)
 
     @property
     def scheme(self) -> str:
