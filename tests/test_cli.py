@@ -38,7 +38,7 @@ from twin.model.mechanism import PLACES, WHENS
 from twin.signals import SAMPLE, TICK
 
 GRIPPER = rigs.path_of("gripper")
-PATIENCE_S = 30.0  # for a busy machine; nothing waits that long otherwise
+PATIENCE_S = 30.0  # s; only a busy machine takes so long
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Every call of the log and every write of the other outputs fails in turn, and no row is lost.
 
 In the manner of SQLite's tests. A first run without faults counts the calls, so that new ones are
-covered by themselves. Time is the test's own: nothing waits.
+covered by themselves. Time is the test's own, so that the test does not sleep.
 """
 
 import errno

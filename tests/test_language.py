@@ -6,7 +6,9 @@ English. A page of short, odd sentences scores well too: hence the phrases.
 """
 
 import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -44,6 +46,8 @@ BANNED = {
     r"\bso many of them\b": "say how many",
     r"\bthe less of what\b": "two quantities and how one follows the other",
 }
+# A key of a configuration is described by a noun phrase: these words refer to one that is missing.
+WITHOUT_NOUN = re.compile(r"(of|that|the same|than|so)\b", flags=re.I)
 WORDS = re.compile(r"[A-Za-z][A-Za-z'’-]*")
 
 
@@ -134,6 +138,30 @@ def banned(text: str) -> list[str]:
     ]
 
 
+def remarks(source: str) -> Iterator[str]:
+    """Docstrings, and comments; those on successive lines are one text."""
+    comments: list[str] = []
+    last = 0
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            is_alone = not token.line[: token.start[1]].strip()
+            if not is_alone or token.start[0] > last + 1:
+                yield " ".join(comments)
+                comments = []
+            comments.append(token.string.lstrip("# "))
+            last = token.start[0]
+    yield " ".join(comments)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def keys() -> list[tuple[str, str]]:
+    """Each key on the page of all keys, with its description."""
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    return re.findall(r"^\| `(\w+)` \|.* \| (.*) \|$", page, flags=re.M)
+
+
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_reads_easily(page: Path) -> None:
     text = prose(page.read_text(encoding="utf-8"))
@@ -159,8 +187,30 @@ def test_no_string_of_the_programs_is_a_riddle() -> None:
     assert not [(place, found) for place, text in strings for found in banned(text)]
 
 
+@pytest.mark.parametrize("folder", ["twin", "drivers", "tools", "tests"])
+def test_no_docstring_and_no_comment_is_a_riddle(folder: str) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}: {riddle}"
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for remark in remarks(path.read_text(encoding="utf-8"))
+        for riddle in banned(remark)
+    ]
+    assert not found
+
+
+def test_a_key_is_described_by_a_noun() -> None:
+    assert len(keys()) > 100
+    assert not [(key, text) for key, text in keys() if WITHOUT_NOUN.match(text)]
+
+
 def test_the_check_finds_what_it_is_for() -> None:
     assert banned("Where it\nhas it from is told.") == ["'has it from': name its source"]
+    source = '"""A module."""\n# It has\n# it from there.\nx = 1  # mbar\n'
+    assert [text for text in remarks(source) if text] == [
+        "It has it from there.",
+        "mbar",
+        "A module.",
+    ]
     easy, hard = "The tank leaks. Close the valve. ", "Instrumentation heterogeneity necessitates. "
     assert reading_ease(50 * easy) > 90.0
     assert reading_ease(50 * hard) < 0.0

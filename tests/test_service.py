@@ -19,7 +19,7 @@ from twin.cli.stopping import INTERRUPTED
 from twin.errors import ConfigError
 from twin.service import FEEDS, Service
 
-PATIENCE_S = 60.0  # for a busy machine; nothing waits that long otherwise
+PATIENCE_S = 60.0  # s; only a busy machine takes so long
 DEPLOY = rigs.ROOT / "deploy"
 
 

@@ -182,7 +182,7 @@ class Trace(Follower[Header, ModbusClient]):
     def _overwritten(self, link: ModbusClient, header: Header) -> int:
         """Sequence up to which the PLC may have overwritten records since ``header``."""
         scans = self.header(link).advance(header)
-        if scans is None:  # it restarted: nothing of what was read can be trusted
+        if scans is None:  # it restarted, so the read records are invalid
             return self._newest
         return self._newest + scans - header.depth + 1  # one is being written
 

@@ -589,7 +589,7 @@ class PhaseFinder:
         return self._seen - int(_unsettled(self._state, settings))
 
     def _reported(self) -> npt.NDArray[np.uint8]:
-        """What is told of the nozzle in each row."""
+        """The reported nozzle in each row: the ejector's reports, or ``nozzle`` instead."""
         if self.nozzle is None:
             return np.ascontiguousarray(self._rows["reported"])
         told = self.nozzle[self._dropped : self._dropped + len(self._rows)]

@@ -501,7 +501,7 @@ class Page:
     async def live(self, socket: WebSocket) -> None:
         """Send all ejectors' states every second, and rows of the one that the browser watches.
 
-        A slow browser gets only the newest data; nothing waits for it.
+        A slow browser gets only the newest data; the server does not wait for it.
         """
         allowed = self.access.is_own_origin(socket.headers) and self._may_see(socket)
         if not (allowed and self.ejectors):
