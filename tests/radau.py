@@ -59,7 +59,7 @@ def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     missing = theta[c.SUPPLY_NOMINAL] - supply
     end = theta[c.END_RATIO] * ambient * (1.0 + theta[c.END_SLOPE] * missing)
     end = min(max(end, 0.0), 0.98 * ambient)
-    deep = 1.0 - theta[c.JET_DEPTH] * (1.0 - jet)
+    deep = 1.0 - theta[c.JET_DEPTH] * (1.0 - jet) - theta[c.MOVED] / (ambient - end)
     x = max(deep - (ambient - p) / (ambient - end), 0.0)
     share = max(characteristic(theta, min(x, 1.0)), 0.0)
     if x > 1.0:  # above ambient it goes on straight

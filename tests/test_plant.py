@@ -189,6 +189,17 @@ def test_suction_runs_from_capacity_at_ambient_to_none_at_end_pressure() -> None
     assert suction_at(theta, theta[c.END_RATIO] * theta[c.AMBIENT]) == 0.0
 
 
+def test_a_characteristic_that_moves_gives_at_each_pressure_what_it_gave_below() -> None:
+    theta = rigs.theta("test_rig")
+    moved = theta.copy()
+    moved[c.MOVED] = 40.0 * MBAR
+    for vacuum in (0.0, 150.0, 400.0):
+        p = theta[c.AMBIENT] - vacuum * MBAR
+        assert suction_at(moved, p) == pytest.approx(suction_at(theta, p - 40.0 * MBAR))
+    end = theta[c.END_RATIO] * theta[c.AMBIENT] + 40.0 * MBAR
+    assert suction_at(moved, end) == 0.0 < suction_at(moved, end + 5.0 * MBAR)
+
+
 # Flows at the nodes.
 
 

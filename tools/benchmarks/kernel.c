@@ -17,7 +17,7 @@
 enum { /* twin.model.theta.COEFFICIENTS */
     AMBIENT, AMBIENT_NOMINAL, TEMPERATURE, SUPPLY, DROOP, SUPPLY_LAG, SUPPLY_NOMINAL,
     SUPPLY_OPTIMUM, SUPPLY_CURVATURE, END_SLOPE, SUCTION, END_RATIO, EXHAUST_FOLLOWS, FILTER_AT,
-    END_FOLLOWS, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT, RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP,
+    END_FOLLOWS, END_MOVES, MOVED, BULGE, SKEW, BEND_2, BEND_3, KINK, KINK_AT, RESPONSE, RESPONSE_OFF, RAMP_UP, SLOW_RAMP_UP,
     JET_FULL_AT, JET_DEPTH, RAMP_DOWN, BLOW_OFF, BLOW_OFF_SHAPE, BLOW_OFF_DRAIN,
     BLOW_OFF_REFILL, BLOW_OFF_RESPONSE, BLOW_OFF_RESPONSE_OFF, BLOW_OFF_RAMP, BLOW_OFF_RAMP_DOWN, RELIEF,
     RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
@@ -166,7 +166,7 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
 {
     double ambient = K(AMBIENT);
     double per_pa = 1.0 / (ambient - driven->end);
-    double depth = driven->jet + (1.0 - K(JET_DEPTH)) * (1.0 - driven->jet);
+    double depth = driven->jet + (1.0 - K(JET_DEPTH)) * (1.0 - driven->jet) - K(MOVED) * per_pa;
     Tangent curve = characteristic(depth - (ambient - p) * per_pa, k);
     double out_slope = driven->jet * driven->suction * per_pa * curve.slope;
     double out = driven->jet * driven->suction * curve.level - out_slope * p;

@@ -141,6 +141,8 @@ class Ejector(Settings):
     filter_before_sensor: float = Field(0.0, ge=0.0, le=1.0)
     # Factor on end_pressure_slope for a supply below nominal.
     end_follows_supply: float = Field(1.0, ge=0.1, le=20.0)
+    # Share of a rise of the end pressure that moves the whole characteristic to higher pressures.
+    end_loss_moves: float = Field(0.0, ge=0.0, le=1.0)
     relief_sl_min: NotNegative = 200.0  # relief flow at 100 mbar above the relief pressure
     exhaust_sl_min: NotNegative = 0.0  # sonic flow through an exhaust that is an opening
     # Port pressure above ambient that opens the check valve.
@@ -387,6 +389,7 @@ def _set_ejector(theta: Theta, ejector: Ejector, end_ratio: float) -> None:
     theta[c.EXHAUST_FOLLOWS] = ejector.exhaust_follows
     theta[c.FILTER_AT] = ejector.filter_before_sensor
     theta[c.END_FOLLOWS] = ejector.end_follows_supply
+    theta[c.END_MOVES] = ejector.end_loss_moves
     theta[[c.KINK, c.KINK_AT]] = ejector.kink, ejector.kink_at
     theta[c.RESPONSE] = ejector.response_ms * MS
     theta[c.RESPONSE_OFF] = ejector.response_off_ms * MS

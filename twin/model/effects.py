@@ -188,7 +188,9 @@ def _suction_loss(theta: Theta, percent: float) -> None:
 
 
 def _end_vacuum_loss(theta: Theta, rise: float) -> None:
-    theta[c.END_RATIO] += rise * MBAR / theta[c.AMBIENT_NOMINAL]
+    moved = theta[c.END_MOVES] * rise * MBAR
+    theta[c.MOVED] += moved
+    theta[c.END_RATIO] += (rise * MBAR - moved) / theta[c.AMBIENT_NOMINAL]
 
 
 def _supply_pressure_drop(theta: Theta, drop: float) -> None:
@@ -296,8 +298,11 @@ _TABLE = (
         "end_vacuum_loss",
         "The highest vacuum it can reach is lower: worn receiver nozzle or clogged silencer",
         "the receiver nozzle for wear, the silencer for dirt",
-        (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0, (c.END_RATIO,)),),
+        (_P("end_pressure_rise", "mbar", 0.0, 600.0, 20.0, (c.END_RATIO, c.MOVED)),),
         _end_vacuum_loss,
+        # Of one stage the flow at ambient pressure stays. Of two the back pressure of a silencer
+        # moves the second one, which has most of the flow: two rigs of momentum theory.
+        law=Law("end_loss_moves", c.END_MOVES, (0.0, 1.0)),
     ),
     Effect(
         "supply_pressure_drop",

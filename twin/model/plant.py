@@ -234,7 +234,7 @@ def suction_at(theta: Theta, p: float) -> float:
 @compiled
 def _suction_at(k: Prepared, p: float) -> float:
     suction, end, _ = at_supply(k[c.SUPPLY_NOMINAL, 0], k, 0)
-    share, _ = characteristic((p - end) / (k[c.AMBIENT, 0] - end), k, 0)
+    share, _ = characteristic((p - end - k[c.MOVED, 0]) / (k[c.AMBIENT, 0] - end), k, 0)
     return suction * share
 
 
@@ -249,7 +249,7 @@ def port_flows(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, fl
     """
     ambient = k[c.AMBIENT, i]
     per_pa = 1.0 / (ambient - driven.end)
-    depth = driven.jet + (1.0 - k[c.JET_DEPTH, i]) * (1.0 - driven.jet)
+    depth = driven.jet + (1.0 - k[c.JET_DEPTH, i]) * (1.0 - driven.jet) - k[c.MOVED, i] * per_pa
     share, rise = characteristic(depth - (ambient - p) * per_pa, k, i)
     out_slope = driven.jet * driven.suction * per_pa * rise
     out = driven.jet * driven.suction * share - out_slope * p
