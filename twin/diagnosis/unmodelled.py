@@ -52,7 +52,8 @@ class Unmodelled:
     def is_large(self, number: int) -> bool:
         """Whether a cause explains more than the waveforms of all are off by.
 
-        A smaller one may correct a waveform. So what suits its place is no evidence of something unlisted.
+        A smaller one may correct a waveform. So what suits its place is no evidence of something
+        unlisted.
         """
         explained = np.sqrt(np.mean((self._off - self._off[:, :1]) ** 2, axis=0))
         return bool(explained[1 + number] > MISMATCH * explained[-1])
