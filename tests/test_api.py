@@ -357,7 +357,10 @@ def test_a_summary_says_what_matters(tutorial: Read, here: Path) -> None:
     healthy = Shown(names["healthy"]._repr_html_()).text
     assert "compact-ejector-35 cell-3" in healthy
     assert "mbar rms" in healthy
-    assert "8 healthy cycles" in Shown(names["calibrated"]._repr_html_()).text
+    calibrated = Shown(names["calibrated"]._repr_html_()).text
+    assert "8 healthy cycles" in calibrated
+    assert "Good: the twin follows this record" in calibrated
+    assert "times the floor" in calibrated
     answer = Shown(names["answer"]._repr_html_()).text
     for text in ("Cause found: Air leaks in", "hoses, fittings and cups", "less rms deviation"):
         assert text in answer
@@ -432,6 +435,7 @@ def test_a_calibration_has_its_values_in_the_fields_units(tutorial: Read) -> Non
         value = getattr(calibrated, name.partition(".")[2])
         assert value == pytest.approx(calibrated.values[name]["value"])
     assert f"{calibrated.rms_mbar:.2f} mbar rms off" in str(calibrated)
+    assert calibrated.verdict == "good"
 
 
 def test_a_curve_keeps_its_peaks_however_long_it_is() -> None:
@@ -455,7 +459,8 @@ def commissioned(tutorial: Read, times: float = 1.0) -> twin.Commissioned:
     healthy = tutorial.names["healthy"]
     samples = np.concatenate(list(healthy._samples()))
     calibration, remark = tutorial.names["calibrated"]._calibration, Remark(EVIL, "volume_ml = 750")
-    found = Commissioning(calibration, read(samples), verdict(times), (remark,), (), samples)
+    calibration = replace(calibration, verdict=verdict(times))
+    found = Commissioning(calibration, read(samples), (remark,), (), samples)
     given = dict[str, Any]()
 
     def fit(config: Config, blocks: Iterable[Samples], _say: object) -> Commissioning:

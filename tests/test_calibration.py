@@ -8,6 +8,7 @@ import calibrations
 import numpy as np
 import pytest
 import rigs
+import written_pages
 from calibrations import CYCLES, beside, calibrated, log_of, quiet, rig, typed
 
 from tools.calibration_coverage import SYSTEMS, TRUE, drawn, misses, recorded
@@ -16,15 +17,16 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.fit import fit
 from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.parameters import FREE, Space, directions, values, with_values
-from twin.calibration.report import as_json, in_words
+from twin.calibration.report import as_json, calibration_word, in_words
 from twin.calibration.save import store
 from twin.calibration.stationarity import refuse_changing
+from twin.calibration.verdict import USABLE
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.errors import ConfigError
 from twin.live import Twin, run
 from twin.model import theta as c
-from twin.model.dataset import coefficients
+from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import warped
 from twin.monitor.cycles import PAPER_VACUUM, CycleCutter, time_to_vacuum
@@ -234,6 +236,44 @@ def test_it_says_what_it_found_in_words_and_for_programs(tmp_path: Path) -> None
     assert answer["asset"] == {"type": "compact-ejector-35", "id": "gripper-01"}
     assert record.provenance["log"] == "log.mcap"
     assert record.valid_from_ns == found.first_ns
+
+
+@pytest.mark.parametrize(("name", "worst"), [("test_rig", 1.3), ("gripper", 1.5)])
+def test_the_twins_of_the_shipped_rigs_are_good(name: str, worst: float) -> None:
+    """They follow their record as closely as its cycles follow each other."""
+    verdict = calibrated(name).verdict
+    assert set(verdict.residuals) == set(Phase)
+    assert verdict.word == "good"
+    assert verdict.worst == pytest.approx(worst, abs=0.05)  # as docs/calibration.md says
+    assert "\ngood: " in in_words(calibrated(name))
+
+
+def test_a_calibration_beyond_its_floor_is_stored_with_a_word(tmp_path: Path) -> None:
+    """As that for a volume that is not the unit's, in which all flows are found too large."""
+    tables = typed("gripper").data.model_dump()
+    tables["system"]["parts"][-1]["volume_ml"] *= 1.6
+    config = replace(typed("gripper"), data=DataSet.model_validate(tables))
+    found = calibrate(config, [log_of("gripper")], quiet)
+    assert "\nbeyond twice its floor: " in in_words(found)
+    log = tmp_path / "log.mcap"
+    log.write_bytes(b"a log")
+    record, _ = store(found, config, f"sqlite:///{tmp_path}/assets.sqlite", log)
+    answer = json.loads(json.dumps(as_json(found, record)))
+    assert answer["verdict"] == "beyond"
+    worst = max(answer["residual"].values(), key=lambda residual: float(residual["times"]))
+    assert worst["times"] == pytest.approx(worst["left_mbar"] / worst["floor_mbar"])
+    assert worst["times"] > USABLE
+
+
+def test_what_is_beyond_twice_the_floor_is_not_called_calibrated_without_a_word() -> None:
+    beyond = written_pages.commissioned("refused").calibration
+    said = in_words(beyond)
+    assert calibration_word(beyond.verdict) == "beyond"
+    assert "beyond twice its floor: the twin is off by more than its cycles differ" in said
+    assert "times in blow-off" in said
+    assert "twin commission" in said
+    assert "stored" not in said
+    assert calibration_word(written_pages.commissioned("usable").calibration.verdict) == "usable"
 
 
 def test_what_was_stored_is_what_the_configuration_gives(tmp_path: Path) -> None:

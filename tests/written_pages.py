@@ -63,9 +63,8 @@ def commissioned(word: str) -> Commissioned:
     residuals[Phase.HOLD] = Residual(TIMES[word] * MBAR, MBAR, -3.25 * MBAR, 123 * MS)
     residuals[Phase.BLOW_OFF] = Residual(TIMES[word] * MBAR, MBAR, 31.25 * MBAR, 12 * MS)
     made = Commissioned(
-        Calibration(fitted, Healthy(), 8, 0, 1),
+        Calibration(fitted, Verdict(residuals), Healthy(), 8, 0, 1),
         replace(read(samples), period=8.0 * MS),
-        Verdict(residuals),
         () if word == "good" else REMARKS,
         () if word == "good" else (CONTRADICTION,),
         samples,

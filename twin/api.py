@@ -230,6 +230,11 @@ class Calibrated:
         return calibration_report.parameters(self._calibration)
 
     @property
+    def verdict(self) -> str:
+        """Good, usable, or beyond: off by more than twice what the cycles of the log differ by."""
+        return calibration_report.calibration_word(self._calibration.verdict)
+
+    @property
     def rms_mbar(self) -> float:
         """Deviation (mbar, rms) that the fit leaves in the healthy cycles."""
         return self._calibration.fitted.left / MBAR

@@ -11,7 +11,9 @@ from scipy.linalg import block_diag
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE, Space
+from twin.calibration.readings import read
 from twin.calibration.stationarity import refuse_changing
+from twin.calibration.verdict import Verdict, judge
 from twin.config import Config
 from twin.diagnosis.evidence import collect
 from twin.diagnosis.healthy import learned
@@ -39,9 +41,10 @@ NOTHING: Mapping[str, float] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration: the fit of one unit, and its healthy scatter."""
+    """Result of a calibration: the fit of one unit, its verdict, and the healthy scatter."""
 
     fitted: Fitted
+    verdict: Verdict
     healthy: Healthy
     cycles: int
     first_ns: int  # host time of the log's first and last row
@@ -69,9 +72,11 @@ def calibrate(
     cycles = complete(fitted.data, samples)
     refuse_unalike(fitted.data, samples, cycles)
     refuse_unlike(fitted, config.data)
+    progress("judging the fit")
+    verdict = judge(Cycles.found(samples[used], fitted.data), fitted.data, read(samples).noise)
     healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
-    return Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
+    return Calibration(fitted, verdict, healthy, len(cycles), int(times[0]), int(times[-1]))
 
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:

@@ -114,11 +114,15 @@ class Commissioned:
 
     calibration: Calibration
     readings: Readings
-    verdict: Verdict
     remarks: tuple[Remark, ...]
     contradictions: tuple[Contradiction, ...]  # between reported signals and the pressure
     samples: Samples  # on which the twin was judged
     doubts: tuple[Doubt, ...] = ()  # that the record is of a healthy unit
+
+    @property
+    def verdict(self) -> Verdict:
+        """How well the twin follows the record."""
+        return self.calibration.verdict
 
     @property
     def assumed(self) -> list[str]:
@@ -227,18 +231,13 @@ def commission(
     healthy = _healthy(replace(config, data=fitted.data), fitted, cycles, samples, sigma)
     healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
     times = samples["host_ns"]
-    calibration = Calibration(fitted, healthy, len(cycles), int(times[0]), int(times[-1]))
+    ends = int(times[0]), int(times[-1])
+    calibration = Calibration(fitted, verdict, healthy, len(cycles), *ends)
     doubts = list(measured_doubts(within(config.data, fitted.data.ambient), readings, healthy))
     if verdict.word != "refused":
         doubts += doubts_of_type(config, fitted)
     return Commissioned(
-        calibration,
-        readings,
-        verdict,
-        tuple(remarks),
-        tuple(contradictory),
-        samples,
-        tuple(doubts),
+        calibration, readings, tuple(remarks), tuple(contradictory), samples, tuple(doubts)
     )
 
 

@@ -10,6 +10,7 @@ from twin.calibration.picture import draw_fit
 from twin.calibration.read_off import read_off
 from twin.calibration.report import (
     calibration_headline,
+    calibration_verdict,
     headline,
     parameters,
     sentences,
@@ -31,7 +32,7 @@ def summary(commissioned: Commissioned, asset: Asset) -> str:
     """A commissioning as a part of a page: verdict, what to change, residuals, a small picture."""
     mark, colour = MARKS[commissioned.verdict.word]
     title = f"{mark} {asset.type} {asset.id}: {headline(commissioned.verdict)}"
-    parts = [*_remarks(commissioned), _residuals(commissioned)]
+    parts = [*_remarks(commissioned), _residuals(commissioned.verdict)]
     picture = draw_fit(commissioned.calibration.fitted.data, commissioned.samples)
     return page.summary(title, parts, picture, colour)
 
@@ -40,7 +41,9 @@ def calibration_summary(calibration: Calibration, asset: Asset, samples: Samples
     """A calibration as a part of a page: how close it is, its values, and a small picture."""
     title = f"{asset.type} {asset.id}: {calibration_headline(calibration)}"
     picture = draw_fit(calibration.fitted.data, samples)
-    return page.summary(title, [_parameters(calibration)], picture)
+    verdict = page.paragraph(f"{capital(calibration_verdict(calibration.verdict))}.")
+    parts = [verdict, _residuals(calibration.verdict), _parameters(calibration)]
+    return page.summary(title, parts, picture)
 
 
 def write_page(
@@ -59,7 +62,7 @@ def _page(commissioned: Commissioned, asset: Asset) -> str:
         page.section(tr("Why"), "\n".join(why)),
         page.section(tr("What to change"), "\n".join(_remarks(commissioned))),
         _picture(commissioned),
-        page.section(tr("How close"), _residuals(commissioned)),
+        page.section(tr("How close"), _residuals(commissioned.verdict)),
         page.section(tr("Read off the record"), _read_off(commissioned)),
         page.section(
             tr("What was found"),
@@ -102,7 +105,7 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
         yield page.paragraph(f"{capital(commissioned.unseen)}.")
 
 
-def _residuals(commissioned: Commissioned) -> str:
+def _residuals(verdict: Verdict) -> str:
     head = (tr("phase"), tr("rms left, mbar"), tr("floor, mbar"), tr("times the floor"))
     rows = (
         (
@@ -112,7 +115,7 @@ def _residuals(commissioned: Commissioned) -> str:
                 for value in (residual.left / MBAR, residual.floor / MBAR, residual.times)
             ),
         )
-        for phase, residual in commissioned.verdict.residuals.items()
+        for phase, residual in verdict.residuals.items()
     )
     caption = tr("The floor is what cycles of this record differ by, noise included")
     return page.table(caption, head, rows, numbers=(1, 2, 3))

@@ -13,13 +13,36 @@ from twin.errors import TwinError
 from twin.languages.texts import numeral, tr
 from twin.signals import MBAR, MS, Phase
 
+# A calibration that is off by more than twice its floor. It is stored all the same.
+BEYOND = "beyond"
+
 
 def in_words(calibration: Calibration) -> str:
-    """A table of the parameters: value, 95 % interval and source."""
-    fitted = calibration.fitted
+    """How close the model came and the verdict on that, then the parameters."""
     lines = [
         calibration_headline(calibration),
+        calibration_verdict(calibration.verdict),
         "",
+        *_residuals(calibration.verdict),
+        "",
+        _values(calibration),
+    ]
+    return "\n".join(lines)
+
+
+def _residuals(verdict: Verdict) -> list[str]:
+    """What is left in each phase beside the floor of the record."""
+    return [
+        f"{phase.name.lower().replace('_', '-'):<10}{residual.left / MBAR:>7.2f} mbar rms off;"
+        f" this record cannot be followed nearer than {residual.floor / MBAR:.2f}"
+        for phase, residual in verdict.residuals.items()
+    ]
+
+
+def _values(calibration: Calibration) -> str:
+    """A table of the parameters (value, 95 % interval and source), and the healthy deviation."""
+    fitted = calibration.fitted
+    lines = [
         f"{'parameter':<34}{'value':>9}   {'95 % interval':<19}{'unit':<11}from",
     ]
     for free, is_determined in zip(fitted.free, fitted.determined, strict=True):
@@ -37,6 +60,20 @@ def calibration_headline(calibration: Calibration) -> str:
     """How many cycles were fitted, and how close the model came."""
     left = calibration.fitted.left / MBAR
     return f"{calibration.cycles} healthy cycles; the model is {left:.2f} mbar rms off"
+
+
+def calibration_word(verdict: Verdict) -> str:
+    """The verdict on a calibration in a word: ``good``, ``usable`` or ``beyond``."""
+    return BEYOND if verdict.word == "refused" else verdict.word
+
+
+def calibration_verdict(verdict: Verdict) -> str:
+    """The verdict on a calibration, which refuses none for it, and what it rests on."""
+    if calibration_word(verdict) != BEYOND:
+        return headline(verdict)
+    word = tr("beyond twice its floor")
+    advice = tr("Commission the unit instead: twin commission fits more of it")
+    return f"{word}: {_beyond(verdict)}. {advice}"
 
 
 def _scatter(calibration: Calibration) -> list[str]:
@@ -57,9 +94,25 @@ def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
         "record": record.id,
         "cycles": calibration.cycles,
         "left_mbar": calibration.fitted.left / MBAR,
+        "verdict": calibration_word(calibration.verdict),
+        "residual": residuals_as_json(calibration.verdict),
         "parameters": parameters(calibration),
         "healthy": dict(record.healthy),
         "data": dict(record.data),
+    }
+
+
+def residuals_as_json(verdict: Verdict) -> dict[str, dict[str, float]]:
+    """What is left in each phase beside the floor of the record, and the largest of it."""
+    return {
+        phase.name.lower(): {
+            "left_mbar": residual.left / MBAR,
+            "floor_mbar": residual.floor / MBAR,
+            "times": residual.times,
+            "most_mbar": residual.most / MBAR,
+            "at_ms": residual.at / MS,
+        }
+        for phase, residual in verdict.residuals.items()
     }
 
 
@@ -82,11 +135,7 @@ def parameters(calibration: Calibration) -> dict[str, dict[str, Any]]:
 def commissioned_in_words(commissioned: Commissioned) -> str:
     """The verdict, the record's corrections, the parameters and the assumed values."""
     lines = [headline(commissioned.verdict), ""]
-    lines += [
-        f"{phase.name.lower().replace('_', '-'):<10}{residual.left / MBAR:>7.2f} mbar rms off;"
-        f" this record cannot be followed nearer than {residual.floor / MBAR:.2f}"
-        for phase, residual in commissioned.verdict.residuals.items()
-    ]
+    lines += _residuals(commissioned.verdict)
     if commissioned.verdict.word == "refused":
         lines += ["", to_check()]
     for doubt in commissioned.doubts:
@@ -105,7 +154,8 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
         f"  {entry.name:<50}{entry.shown:>8} {entry.unit:<5}{entry.known_from}"
         for entry in read_off(commissioned)
     ]
-    lines += ["", in_words(commissioned.calibration)]
+    calibration = commissioned.calibration
+    lines += ["", calibration_headline(calibration), "", _values(calibration)]
     if commissioned.unseen:
         lines += ["", commissioned.unseen]
     if commissioned.assumed:
@@ -122,8 +172,7 @@ def sentences(verdict: Verdict) -> list[str]:
     """What the verdict rests on, and what follows from it; none ends in a full stop."""
     if verdict.word == "good":
         return [tr("the twin follows this record as closely as its cycles follow each other")]
-    weak = "; ".join(_weak(phase, verdict.residuals[phase]) for phase in verdict.weak)
-    beyond = tr("the twin is off by more than its cycles differ: {weak}", weak=weak)
+    beyond = _beyond(verdict)
     if verdict.word == "usable":
         return [beyond, tr("Causes that act there are named less surely")]
     return [
@@ -144,6 +193,12 @@ def to_check() -> str:
         "Check in [data.system.parts] hoses (length, inner diameter), volumes, and whether parts"
         " are released (cups) or stay (vessel); check on the machine whether the unit is healthy"
     )
+
+
+def _beyond(verdict: Verdict) -> str:
+    """That the twin is off by more than its cycles differ, and in which phases."""
+    weak = "; ".join(_weak(phase, verdict.residuals[phase]) for phase in verdict.weak)
+    return tr("the twin is off by more than its cycles differ: {weak}", weak=weak)
 
 
 def _weak(phase: Phase, off: Residual) -> str:
@@ -179,16 +234,7 @@ def commissioned_as_json(
         "record": record.id if record else None,
         "verdict": commissioned.verdict.word,
         **_refused_because(commissioned.verdict),
-        "residual": {
-            phase.name.lower(): {
-                "left_mbar": residual.left / MBAR,
-                "floor_mbar": residual.floor / MBAR,
-                "times": residual.times,
-                "most_mbar": residual.most / MBAR,
-                "at_ms": residual.at / MS,
-            }
-            for phase, residual in commissioned.verdict.residuals.items()
-        },
+        "residual": residuals_as_json(commissioned.verdict),
         "contradicts": [
             {"what": remark.text, "line": remark.line} for remark in commissioned.remarks
         ],
