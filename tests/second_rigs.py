@@ -78,3 +78,14 @@ def with_signals(logged: Record, slow_ms: float = 5.0) -> Samples:
     rows["reported"] |= np.uint8(Reported.FLOW_KNOWN)
     rows["pressure_2"] = truth.noted_ambient - 1.003 * vacuum + (2.0 + 0.4 * noise[1]) * MBAR
     return rows
+
+
+def with_gauge(logged: Record) -> Samples:
+    """The same with a gauge of the supply, 0.05 bar off, with noise of 10 mbar and its steps."""
+    rows, truth = samples_of(logged), logged.truth
+    rng = np.random.default_rng(truth.rig.seed)
+    when = np.round(logged.time_ns * 1e-6 - 1.0).astype(int)
+    gauge = truth.supply_pressure[when.clip(0, len(truth.supply_pressure) - 1)]
+    gauge = gauge - truth.noted_ambient + 50.0 * MBAR + rng.normal(0.0, 10.0 * MBAR, len(rows))
+    rows["supply"] = np.round(gauge / (10.0 * MBAR)) * 10.0 * MBAR
+    return rows

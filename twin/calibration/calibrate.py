@@ -26,6 +26,7 @@ from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.detector_window import as_wide_as_needed
 from twin.monitor.healthy import Healthy, Scatter, sure
+from twin.monitor.measured_supply import SUPPLY, supplied
 from twin.monitor.signal_checks import Contradiction, standing
 from twin.monitor.surroundings import taken_in
 from twin.quality import BREAK, UNUSABLE
@@ -60,7 +61,7 @@ def calibrate(
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    config = replace(config, data=taken_in(config.data, samples))
+    config = replace(config, data=taken_in(supplied(config.data, samples), samples))
     before = complete(config.data, samples)
     refuse_insufficient(samples, before, "calibration")
     refuse_contradicting(before, config.data)
@@ -222,9 +223,13 @@ def rounding(data: DataSet, samples: Samples) -> float:
 
 
 def limited(data: DataSet, samples: Samples) -> dict[str, Scatter]:
-    """Scatter of a healthy record's limited key figures that at least FEWEST cycles have."""
+    """Scatter of a healthy record's limited key figures that at least FEWEST cycles have.
+
+    The supply is among them: what a gauge reads later is compared with it.
+    """
     key_figures = KeyFigures(data)
     told_cycles = [*filter(None, map(key_figures.take, whole(Twin.of(data).over([samples]))))]
-    by_name = {name: np.array([cycle.measured[name] for cycle in told_cycles]) for name in LIMITED}
+    names = (*LIMITED, SUPPLY)
+    by_name = {name: np.array([cycle.measured[name] for cycle in told_cycles]) for name in names}
     by_name = {name: values[np.isfinite(values)] for name, values in by_name.items()}
     return {name: _scatter(values) for name, values in by_name.items() if len(values) >= FEWEST}

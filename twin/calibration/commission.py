@@ -42,6 +42,7 @@ from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
 from twin.monitor.cycles import FEWEST_ROWS, Cycle
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy
+from twin.monitor.measured_supply import supplied
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
@@ -87,6 +88,7 @@ DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at wh
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar: ambient pressure is reported if it differs by more
+SUPPLY_CLEARLY = 0.2  # bar: the same for the supply; gauges and regulators scatter by half of it
 # Relative difference from the configured volume above which that of the flow meter is used: nearly
 # twice a flow meter's error on rigs whose truth is known.
 VOLUME_CLEARLY = 0.15
@@ -178,7 +180,8 @@ def commission(
     refuse_unreadable(readings)
     optimum_is_told = "optimum_bar" in config.data.supply.model_fields_set
     unseen_level = _unseen_level(config.data, readings)
-    config = replace(config, data=taken_in(config.data, samples))
+    gauged, by_gauge = as_gauged(config.data, samples)
+    config = replace(config, data=taken_in(gauged, samples))
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
     guess, _ = guessed(config.data, readings)
     before = complete(guess, samples)
@@ -223,7 +226,7 @@ def commission(
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
     fitted, remarks = _deciding(fitted, found_cycles, metered, readings)
-    remarks = by_flow + remarks
+    remarks = [*by_gauge, *by_flow, *remarks]
     if verdict.word != "refused":  # the places of a bad fit mean nothing
         remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
     cycles = complete(fitted.data, samples)
@@ -380,6 +383,16 @@ def switching_as(guess: DataSet, data: DataSet) -> DataSet:
     """``data`` with the thresholds of ``guess``."""
     thresholds = {key: getattr(guess.ejector, key) for key in _THRESHOLDS}
     return data.model_copy(update={"ejector": data.ejector.model_copy(update=thresholds)})
+
+
+def as_gauged(data: DataSet, samples: Samples) -> tuple[DataSet, list[Remark]]:
+    """``data`` with the supply pressure that a gauge shows at rest, if there is one."""
+    gauged = supplied(data, samples)
+    measured, configured = gauged.supply.pressure_bar, data.supply.pressure_bar
+    if abs(measured - configured) <= SUPPLY_CLEARLY:
+        return gauged, []
+    text = f"the supply reads {measured:g} bar; the configuration says {configured:g}"
+    return gauged, [Remark(text, f"[data.supply] pressure_bar = {measured:g}")]
 
 
 def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:

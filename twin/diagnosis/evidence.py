@@ -35,6 +35,7 @@ from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
 from twin.monitor.detector_window import as_wide_as_needed, knees_of
 from twin.monitor.healthy import Healthy
+from twin.monitor.measured_supply import lower_by
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import least_time_ms
 from twin.monitor.simulated_switching import Seen, seen
@@ -151,6 +152,27 @@ class Evidence:
     def cycle_of_row(self) -> Ints:
         """Number of the cycle of each row."""
         return np.repeat(self.numbers, np.diff(self.starts))
+
+    @cached_property
+    def supply_drops(self) -> Floats:
+        """How much less (bar) a gauge of the supply reads in each cycle than in healthy ones.
+
+        NaN without a gauge, here or in the healthy cycles.
+        """
+        parts = [slice(first, last) for first, last in pairwise(self.starts.tolist())]
+        return np.array(
+            [lower_by(self.healthy, self.samples[part], self.ticks[part]) for part in parts]
+        )
+
+    @cached_property
+    def nozzle_on(self) -> list[int]:
+        """A row of each cycle half-way through the time that its nozzle is on."""
+        on = self.ticks["phase"] == Phase.SUCTION
+        rows = [first + np.flatnonzero(on[first:last]) for first, last in pairwise(self.starts)]
+        return [
+            int(of_cycle[len(of_cycle) // 2]) if len(of_cycle) else int(first)
+            for of_cycle, first in zip(rows, self.starts[:-1], strict=True)
+        ]
 
     @cached_property
     def _times(self) -> Floats:

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
-from twin.inference.priors import PRIOR_TEMPER
+from twin.inference.priors import PRIOR_TEMPER, by_gauge
+from twin.model import theta as c
 from twin.model.courses import HOUR, Cause, Course
 from twin.model.effects import EFFECTS, Parameter, effect_of
 from twin.monitor.bins import Floats
+from twin.signals import BAR
 
 LOCAL_ONSETS = 20  # onsets in a cycle that can be told apart
 
@@ -78,8 +80,23 @@ def hours(evidence: Evidence, cause: Cause) -> float:
 
 
 def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
-    """Log-prior penalty (chi-square) of a hypothesis: its sizes, and the number of alternatives."""
-    return sum(_price(evidence, cause) for cause in hypothesis)
+    """Log-prior penalty (chi-square) of a hypothesis: its sizes, and the number of alternatives.
+
+    A gauge of the supply speaks for one supply pressure and against others.
+    """
+    prices = sum(_price(evidence, cause) for cause in hypothesis)
+    if any(c.SUPPLY in effect_of(cause.effect).touches for cause in hypothesis):
+        prices += _price_by_gauge(evidence, hypothesis)
+    return prices
+
+
+def _price_by_gauge(evidence: Evidence, hypothesis: Hypothesis) -> float:
+    """Mean over the cycles of what the gauge says, as it is one gauge; 0 without one."""
+    course, cycles = evidence.course(hypothesis), evidence.judged
+    begins = [row for row, _ in course]
+    at = np.searchsorted(begins, [evidence.nozzle_on[cycle] for cycle in cycles], "right") - 1
+    drops = np.array([evidence.theta[c.SUPPLY] - course[number][1][c.SUPPLY] for number in at])
+    return float(np.mean(by_gauge(drops / BAR, evidence.supply_drops[cycles])))
 
 
 def often(evidence: Evidence, cause: Cause) -> float:

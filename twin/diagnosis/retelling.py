@@ -76,6 +76,10 @@ _SIGNALS = (  # reported signals that contradict the pressure, and what to do
     "set [data.ejector] h2_mbar = {value}, or H2 of the ejector",
     "compare both with a third, then check the scale of the tag {tag}",
     "check unit, scale and direction of the tag flow, then volumes in [data.system.parts]",
+    "the supply reads {measured} bar, and the ejector evacuates",
+    "the supply reads {measured} bar; the data set has {usual}, and the pressure is as with that",
+    "check unit and scale of the tag supply: ejectors need {least} to {most} bar",
+    "check the gauge, then unit and scale of the tag supply",
 )
 _ALARMS = (  # evidence of alarms
     "no fresh sample for {time} ms: check PLC and network",
@@ -95,6 +99,7 @@ _COMMISSIONING = (  # what a record corrects in the configuration, and the lines
     "in no suction the nozzle goes off by itself; the configuration has air saving on",
     "no row of the record has blow-off; where the unit has one, its command is missing",
     "the vacuum is {highest} mbar at most, where ejectors make 300 and more",
+    "the supply reads {measured} bar; the configuration says {configured}",
     "by the flow meter {metered} ml are evacuated; the configuration says {configured}",
     "the pressure is read nearer to {place}; the configuration has the sensor nearer to"
     " {configured}",

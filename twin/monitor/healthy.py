@@ -60,7 +60,7 @@ class Healthy(Settings):
     ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows.
     ``meets_ms`` is one sigma of the time at which cups meet the part, if that is after suction
     began. ``rounding_mbar`` is one sigma of the rounding error in a mean of many readings.
-    ``key_figures`` are those that have limits, in their own units.
+    ``key_figures`` are those that have limits, and the measured supply, in their own units.
     """
 
     figures: Mapping[str, Scatter] = Field(default_factory=dict)
