@@ -27,9 +27,9 @@ from twin.events import Event, Kind
 from twin.live import run
 from twin.monitor.cycles import Cycle, whole
 from twin.monitor.signal_checks import ReportWatch, check, standing
-from twin.signals import MBAR, Command, Reported, Samples
+from twin.signals import BAR, MBAR, Command, Reported, Samples
 
-TAGS = {"nozzle", "part_present", "pressure_2", "flow"}
+TAGS = {"nozzle", "part_present", "pressure_2", "flow", "supply"}
 OPENED = TAGS | {"ambient"}
 Change = Callable[[Samples], None]
 
@@ -79,14 +79,24 @@ def test_what_is_right_agrees_in_every_cycle(name: str, tags: set[str], late_ms:
 
 @pytest.mark.parametrize("name", ["test_rig", "gripper"])
 @pytest.mark.parametrize(
-    "fault", ["leakage=4.0", "suction_loss=30", "response_delay=30", "ambient_pressure=-20"]
+    "fault",
+    [
+        "leakage=4.0",
+        "suction_loss=30",
+        "response_delay=30",
+        "ambient_pressure=-20",
+        "supply_pressure_drop=0.7",
+        "supply_pressure_drop=2.5",
+    ],
 )
 def test_a_fault_of_the_ejector_is_none_of_its_signals(name: str, fault: str) -> None:
     assert told(name, simulated(name, faults=(fault,))) == {}
 
 
 def test_where_nothing_is_reported_nothing_is_checked() -> None:
-    cycle = cycles("gripper", rigs.recorded("gripper", 20.0)[0])[1]
+    samples = rigs.recorded("gripper", 20.0)[0].copy()
+    samples["supply"] = np.nan
+    cycle = cycles("gripper", samples)[1]
     assert check(cycle, rigs.theta("gripper"), rigs.knees("gripper")) == {}
 
 
@@ -127,6 +137,18 @@ def flow_in_another_unit(samples: Samples) -> None:
     samples["flow"] *= np.float32(60.0)
 
 
+def gauge_lower(samples: Samples) -> None:
+    samples["supply"] -= np.float32(1.0 * BAR)
+
+
+def gauge_absolute(samples: Samples) -> None:
+    samples["supply"] += np.float32(1013.0 * MBAR)
+
+
+def gauge_in_another_unit(samples: Samples) -> None:
+    samples["supply"] *= np.float32(0.1)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "signal", "words"),
     [
@@ -139,6 +161,9 @@ def flow_in_another_unit(samples: Samples) -> None:
         ("gripper", second, "pressure_2", "reads 51 mbar more"),
         ("test_rig", reversed_flow, "flow", "by the flow -0.4"),
         ("gripper", flow_in_another_unit, "flow", "the pressure shows 0.1"),
+        ("test_rig", gauge_lower, "supply", "the supply reads 4.0 bar; the data set has 5.0"),
+        ("gripper", gauge_absolute, "supply", "the supply reads 6.0 bar; the data set has 5.0"),
+        ("gripper", gauge_in_another_unit, "supply", "reads 0.5 bar, and the ejector evacuates"),
     ],
 )
 def test_a_signal_that_is_wrong_is_told_of_alone(

@@ -12,13 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
+from twin.inference.priors import FARTHEST, GAUGE
+from twin.model import kernel
 from twin.model import theta as c
 from twin.model.gas import R
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
+from twin.monitor.measured_supply import LEAST, MOST, is_possible
+from twin.monitor.rows import time_steps
 from twin.monitor.switching_detector import Knees, PhaseFinder
 from twin.quality import BREAK, UNUSABLE
-from twin.signals import MBAR, NS, SL_MIN, Command, Phase, Reported, Samples
+from twin.signals import BAR, MBAR, NS, SL_MIN, Command, Phase, Reported, Samples, Ticks
 
 PATIENCE = 2  # successive cycles that must contradict, or agree again
 # Permitted difference of two sensors at rest: 1 % of a vacuum sensor's bar, as in the data sheets
@@ -34,6 +38,12 @@ DEEP = 100.0 * MBAR  # Pa, least fall of the pressure for which the flow is chec
 # Bounds of the ratio of gas drawn off by the meter to that by the pressure. Expanding gas cools,
 # so the pressure may show up to 1.4 times too much; a leak adds gas to the meter.
 FLOW_RATIO = 0.5, 3.0
+# A supply that reads farther from the data set's is a fault of the supply, or of its gauge: it is
+# where a diagnosis listens to the gauge no more.
+SUPPLY_APART = FARTHEST * GAUGE  # bar
+SHOWS = 5.0 * MBAR  # Pa rms, by which another supply must move the pressure to be looked for in it
+# Of that move, the least that the pressure has to show. Another ejector's law may have a third.
+FOLLOWED = 0.3
 
 Floats = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.bool_]
@@ -53,6 +63,7 @@ class _View:
     """A cycle, prepared for the checks."""
 
     samples: Samples
+    ticks: Ticks
     pressure: Floats  # Pa, NaN if unusable
     suction: Rows
     idle: Rows
@@ -94,9 +105,10 @@ def check(cycle: Cycle, theta: Theta, knees: Knees) -> dict[str, Contradiction |
     usable = (samples["quality"] & UNUSABLE) == 0
     pressure = np.where(usable, samples["pressure"], np.nan).astype(np.float64)
     commands = samples["commands"] & (Command.SUCTION | Command.BLOW_OFF)
-    view = _View(samples, pressure, commands == Command.SUCTION, commands == 0, theta, knees)
+    suction, idle = commands == Command.SUCTION, commands == 0
+    view = _View(samples, cycle.ticks, pressure, suction, idle, theta, knees)
     outcomes: dict[str, Contradiction | None] = {}
-    for check_signal in (_nozzle, _part, _barometer, _second_pressure, _flow):
+    for check_signal in (_nozzle, _part, _barometer, _second_pressure, _flow, _supply):
         outcomes |= check_signal(view)
     return outcomes
 
@@ -120,7 +132,8 @@ def standing(cycles: Iterable[Cycle], theta: Theta, knees: Knees) -> list[Contra
 
 def _has_reports(samples: Samples) -> bool:
     has_report = samples["reported"].any() or samples["ambient"].any()
-    return bool(has_report or samples["pressure_2"].any())
+    has_report = has_report or samples["pressure_2"].any()
+    return bool(has_report or np.isfinite(samples["supply"]).any())
 
 
 # --- one signal after the other -------------------------------------------------------------------
@@ -277,6 +290,54 @@ def _flow(view: _View) -> dict[str, Contradiction | None]:
     )
     action = "check unit, scale and direction of the tag flow, then volumes in [data.system.parts]"
     return _contradicts("flow", finding, action)
+
+
+def _supply(view: _View) -> dict[str, Contradiction | None]:
+    measured = view.at_rest(view.samples["supply"].astype(np.float64) / BAR)
+    usual = float(view.theta[c.SUPPLY]) / BAR
+    if not np.isfinite(measured):
+        return {}
+    if not is_possible(measured):
+        finding = f"the supply reads {measured:.1f} bar, and the ejector evacuates"
+        action = f"check unit and scale of the tag supply: ejectors need {LEAST:g} to {MOST:g} bar"
+        return _contradicts("supply", finding, action) if _evacuates(view) else {}
+    if abs(measured - usual) <= SUPPLY_APART:
+        return {"supply": None}
+    moved, share = _moved_by_supply(view, measured)
+    if not moved >= SHOWS:
+        return {}
+    if share >= FOLLOWED:
+        return {"supply": None}
+    finding = (
+        f"the supply reads {measured:.1f} bar; the data set has {usual:.1f}, and the pressure is as"
+        " with that"
+    )
+    action = "check the gauge, then unit and scale of the tag supply"
+    return _contradicts("supply", finding, action)
+
+
+def _evacuates(view: _View) -> bool:
+    return bool(np.nanmax(view.pressure) - np.nanmin(view.pressure) > DEEP)
+
+
+def _moved_by_supply(view: _View, supply: float) -> tuple[float, float]:
+    """By how much another ``supply`` (bar) moves the pressure (Pa rms), and the share it shows."""
+    theta = np.stack([view.theta, view.theta], axis=1)
+    theta[c.SUPPLY, 1] = supply * BAR
+    dt = time_steps(view.samples)
+    phase, level = view.ticks["phase"].copy(), view.ticks["level"].astype(np.float64)
+    expected = np.empty((len(dt), 2))
+    state, tolerance = kernel.new_state(2), kernel.COARSE_TOLERANCE
+    kernel.advance(state, theta, dt, phase, level, expected, tolerance=tolerance)
+    moves = expected[:, 1] - expected[:, 0]
+    off = view.pressure - view.ticks["expected"]
+    usable = np.isfinite(moves) & np.isfinite(off)
+    power = float(moves[usable] @ moves[usable])
+    if not power > 0.0:
+        return 0.0, 0.0
+    return float(np.sqrt(power / np.count_nonzero(usable))), float(
+        moves[usable] @ off[usable]
+    ) / power
 
 
 def _contradicts(signal: str, finding: str, action: str) -> dict[str, Contradiction | None]:
