@@ -9,11 +9,13 @@ import rigs
 from calibrations import calibrated, log_of, quiet, typed
 from second_rigs import config_of, with_gauge
 from second_world.draw import draw_rig
+from second_world.faults import Fault
 from second_world.records import record
 
 from twin.calibration.calibrate import calibrate
-from twin.calibration.commission import as_gauged
+from twin.calibration.commission import as_gauged, commission
 from twin.config import Config
+from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import Evidence, collect
 from twin.diagnosis.hypotheses import price
 from twin.inference.priors import FARTHEST, by_gauge
@@ -159,3 +161,33 @@ def test_without_a_gauge_at_the_calibration_there_is_nothing_to_compare_with() -
         priced(replace(evidence, healthy=forgot), Cause("supply_pressure_drop", {"drop": 0.6}))
         == 0.0
     )
+
+
+def named(config: Config, samples: Samples) -> list[tuple[str, list[str]]]:
+    """The causes of a log, each with what the log cannot tell it from."""
+    causes = diagnose(config, [samples], "log", quiet).json["causes"]
+    return [(cause["effect"], cause["not_separable_from"]) for cause in causes]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", rigs.NAMES)
+def test_a_supply_drop_is_told_from_its_look_alikes_by_a_gauge(name: str) -> None:
+    samples = log_of(name, 41, ("supply_pressure_drop=0.6",))
+    assert named(instance(name), samples) == [("supply_pressure_drop", [])]
+    ((effect, alike),) = named(instance(name), blind(samples))
+    assert (effect, alike) == ("supply_pressure_drop", ["weak_blow_off"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # a whole commissioning, on a computer that does other things beside
+def test_beside_a_nominal_gauge_a_weak_ejector_is_no_supply_drop() -> None:
+    rig = draw_rig(SECOND[0])
+    healthy_log = record(rig, SECOND[0], 12)
+    config = config_of(healthy_log.truth.readable)
+    found = commission(config, [with_gauge(healthy_log)], quiet).calibration
+    monitor = config.monitor.model_copy(update={"healthy": found.healthy})
+    unit = replace(config, data=found.fitted.data, monitor=monitor)
+    weak = Fault("end_vacuum_loss", {"end_pressure_rise": 100.0})
+    samples = with_gauge(record(rig, 1_000_000 + SECOND[0], 12, [weak]))
+    assert named(unit, samples) == [("end_vacuum_loss", [])]
+    assert named(unit, blind(samples)) == [("end_vacuum_loss", ["supply_pressure_drop"])]
