@@ -236,12 +236,18 @@ def commission(
     times = samples["host_ns"]
     ends = int(times[0]), int(times[-1])
     calibration = Calibration(fitted, verdict, healthy, len(cycles), *ends)
-    doubts = list(measured_doubts(within(config.data, fitted.data.ambient), readings, healthy))
-    if verdict.word != "refused":
-        doubts += doubts_of_type(config, fitted)
+    doubts = _doubts(config, calibration, readings)
     return Commissioned(
-        calibration, readings, tuple(remarks), tuple(contradictory), samples, tuple(doubts)
+        calibration, readings, tuple(remarks), tuple(contradictory), samples, doubts
     )
+
+
+def _doubts(config: Config, calibration: Calibration, readings: Readings) -> tuple[Doubt, ...]:
+    """Doubts that the record is of a healthy unit; the values of a bad fit are none."""
+    fitted = calibration.fitted
+    configured = within(config.data, fitted.data.ambient)
+    of_type = () if calibration.verdict.word == "refused" else doubts_of_type(config, fitted)
+    return *measured_doubts(configured, readings, calibration.healthy), *of_type
 
 
 def _healthy(
