@@ -1,4 +1,4 @@
-"""What a gauge of the supply is used for: the data set, and what speaks for a drop of it."""
+"""What a gauge of the supply is used for: the data set, and as evidence of a drop of it."""
 
 from dataclasses import replace
 from functools import cache

@@ -58,7 +58,8 @@ def test_every_command_and_option_is_on_the_page() -> None:
             title = f"twin {name} {below}".strip()
             match = re.search(rf"^##+ {title}\n(.*?)(?=^##|\Z)", text, re.DOTALL | re.MULTILINE)
             assert match is not None, title
-            for option in subcommand.params:
+            shown = (it for it in subcommand.params if not getattr(it, "hidden", False))
+            for option in shown:
                 count += 1
                 names = option.opts if option.param_type_name == "option" else [option.metavar]
                 assert all(str(it).replace("|", r"\|") in match[1] for it in names if it), title

@@ -82,7 +82,7 @@ def hours(evidence: Evidence, cause: Cause) -> float:
 def price(evidence: Evidence, hypothesis: Hypothesis) -> float:
     """Log-prior penalty (chi-square) of a hypothesis: its sizes, and the number of alternatives.
 
-    A gauge of the supply speaks for one supply pressure and against others.
+    A gauge of the supply is evidence of one supply pressure and against others.
     """
     prices = sum(_price(evidence, cause) for cause in hypothesis)
     if any(c.SUPPLY in effect_of(cause.effect).touches for cause in hypothesis):

@@ -27,7 +27,7 @@ def tempered(frequency: float) -> float:
 def by_gauge(drop: Floats, read: Floats) -> Floats:
     """Penalty (chi-square) of a lower supply where a gauge reads less by ``read``, both in bar.
 
-    It is that beside an unchanged supply: below zero if the gauge speaks for the ``drop``, and zero
+    It is that beside an unchanged supply: below zero if the gauge shows the ``drop``, and zero
     if there is no gauge (``read`` is NaN).
     """
     off = np.minimum(np.abs(drop - read) / GAUGE, FARTHEST) ** 2
