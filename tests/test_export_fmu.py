@@ -143,6 +143,40 @@ def test_the_unit_lies_over_its_type_in_a_system_structure(
         assert np.abs(result["sensor.pressure"] - by_twin(theta, commands)).max() < 0.1
 
 
+SEEN = """
+[data.catalogue.NAME]
+mechanism = "sensor_warming_up"
+sentence = "What somebody saw"
+parameters.offset = { low = -20.0, high = 20.0, found = 5.0 }
+parameters.sets_in = { low = 1.0, high = 60.0, found = 10.0 }
+"""
+
+
+def test_effects_taken_in_are_parameters_of_unit_and_type_and_those_left_out_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "a.toml"
+    catalogue = "".join(SEEN.replace("NAME", name) for name in ("warm", "warmer", "hot"))
+    found = "[data.effects.sensor_warming_up]\noffset = 3.0\nsets_in = 20.0\n"
+    config.write_text(UNIT + catalogue + found, encoding="utf-8")
+    options = ("--config", config, "--sources-only", "-o", "a.ssp")
+    assert exported(monkeypatch, tmp_path, *options) == 0
+    assert "left out of the catalogue: hot (no more than 2 mechanisms" in capsys.readouterr().err
+    path = str(tmp_path / "a.ssp")
+    kind = values(read_ssv(path, resource="resources/type.ssv"))
+    extract(path, tmp_path / "all")
+    described = read_model_description(str(tmp_path / "all" / "resources" / "paper_unit.fmu"))
+    own = {variable.name: variable for variable in described.modelVariables}
+    names = {name for name in own if name.startswith(("effect.warm", "effect.hot"))}
+    assert names == {f"effect.{of}.{p}" for of in ("warm", "warmer") for p in ("offset", "sets_in")}
+    assert names < set(kind)
+    assert (own["effect.warm.offset"].start, own["effect.warm.offset"].max) == ("3.0", "20.0")
+    assert (own["effect.warmer.offset"].start, own["effect.warmer.sets_in"].start) == (
+        "0.0",
+        "10.0",
+    )
+
+
 @pytest.mark.parametrize("where", ["inside", "outside"])
 def test_every_port_leads_out_of_the_system(
     where: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

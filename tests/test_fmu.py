@@ -23,6 +23,7 @@ from twin.exchange.fmu import make_fmu
 from twin.exchange.variables import Component, Where
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.catalogue import CatalogueEffect, Range
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply
 from twin.model.gas import GAMMA, R
@@ -168,6 +169,119 @@ def test_a_mechanism_of_the_data_set_is_in_the_fmu(
     assert np.abs(seen - by_twin(rigs.theta("gripper"), commands)[1:]).max() > 10 * BOUND
 
 
+def entry(mechanism: str, **ranges: tuple[float, float, float]) -> CatalogueEffect:
+    """An effect taken in: low, found and high of each parameter."""
+    parameters = {
+        name: Range(low=low, found=found, high=high) for name, (low, found, high) in ranges.items()
+    }
+    sentence = f"What somebody saw: {mechanism}"
+    return CatalogueEffect(mechanism=mechanism, sentence=sentence, parameters=parameters)
+
+
+LIP = entry(
+    "opening_above",
+    sonic_flow=(0.0, 3.0, 60.0),
+    begins=(100.0, 400.0, 900.0),
+    ends_below=(1.0, 100.0, 400.0),
+)
+ICE = entry(
+    "nozzle_nozzle_on_slowly",
+    loss=(0.0, 30.0, 90.0),
+    end_pressure_rise=(0.0, 10.0, 600.0),
+    sets_in=(0.1, 1.0, 60.0),
+    fades=(0.1, 2.0, 60.0),
+)
+CUP = entry("volume_beyond", volume_at_full_vacuum=(0.0, 5.0, 90.0), begins=(20.0, 200.0, 900.0))
+BENT = entry(
+    "line_beyond_slowly",
+    pressure_drop_at_nominal=(-100.0, 50.0, 400.0),
+    begins=(20.0, 200.0, 900.0),
+    sets_in=(0.1, 0.5, 60.0),
+)
+SWING = entry(
+    "supply_swinging", drop=(-2.0, 0.7, 2.0), period=(0.3, 1.7, 9.0), shift=(0.0, 0.3, 120.0)
+)
+
+
+@pytest.mark.needs("cc")
+@pytest.mark.parametrize(
+    ("taken_in", "values"),
+    [
+        (LIP, {"sonic_flow": 4.0, "begins": 350.0}),
+        pytest.param(
+            ICE, {"loss": 40.0, "end_pressure_rise": 30.0, "fades": 3.0}, marks=pytest.mark.slow
+        ),
+        (CUP, {"volume_at_full_vacuum": 80.0}),  # more than the cup has: both limit it
+        pytest.param(BENT, {"pressure_drop_at_nominal": 200.0}, marks=pytest.mark.slow),
+        pytest.param(SWING, {"drop": 0.9}, marks=pytest.mark.slow),
+    ],
+    ids=lambda of: of.mechanism if isinstance(of, CatalogueEffect) else "",
+)
+def test_an_effect_of_the_catalogue_acts_as_in_the_twin(
+    taken_in: CatalogueEffect, values: dict[str, float]
+) -> None:
+    data = rigs.config("gripper").data.model_copy(
+        update={"catalogue": {"seen_before": taken_in}, "effects": {"suction_loss": {"loss": 9.0}}}
+    )
+    commands, sizes = cycles("gripper", 2), taken_in.acts_as.place.parameters
+    found = {name: bounds.found for name, bounds in taken_in.parameters.items()}
+    expected = apply(coefficients(data), taken_in.mechanism, {**found, **values})
+    with stepped(fmus.of_data(data)) as (one,):
+        assert all(one.get(f"effect.seen_before.{size.name}") == 0.0 for size in sizes)
+        one.begin()
+        healthy = one.run(commands[:-1])
+        one.fmu.reset()
+        one.time = 0.0
+        one.begin(**{f"effect__seen_before__{name}": value for name, value in values.items()})
+        seen = one.run(commands[:-1])
+    assert np.abs(healthy - by_twin(coefficients(data), commands)[1:]).max() < BOUND
+    assert np.abs(seen - by_twin(expected, commands)[1:]).max() < BOUND
+    assert np.abs(seen - healthy).max() > 10 * BOUND
+
+
+@pytest.mark.needs("cc")
+def test_what_was_found_of_an_effect_of_the_catalogue_is_where_that_starts() -> None:
+    """It is stored as the mechanism that it is, and acts in the data set's order."""
+    found = {"loss": 30.0, "end_pressure_rise": 5.0, "sets_in": 0.5, "fades": 2.0}
+    effects = {ICE.mechanism: found, "suction_loss": {"loss": 20.0}, "opening_above": {
+        "sonic_flow": 1.0, "begins": 50.0, "ends_below": 10.0}}  # fmt: skip
+    data = rigs.config("gripper").data.model_copy(
+        update={"effects": effects, "catalogue": {"lip": LIP, "ice": ICE}}
+    )
+    commands = cycles("gripper", 1)
+    component = Component.of(data, "inside")
+    assert (list(component.slots), component.left_out) == (["ice"], ("lip",))  # out of its bounds
+    with stepped(fmus.of_data(data)) as (one,):
+        assert one.get("effect.ice.loss") == 30.0
+        one.begin()
+        seen = one.run(commands[:-1])
+        one.fmu.reset()
+        one.time = 0.0
+        one.begin(effect__ice__loss=0.0, effect__ice__end_pressure_rise=0.0)
+        mended = one.run(commands[:-1])
+    without = data.model_copy(update={"effects": dict(list(effects.items())[1:])})
+    for values, of in ((seen, data), (mended, without)):
+        assert np.abs(values - by_twin(coefficients(of), commands)[1:]).max() < BOUND
+
+
+def test_an_effect_of_the_catalogue_without_a_slot_is_left_out_and_that_is_said() -> None:
+    gripper = rigs.config("gripper").data
+    effects = {"sensor_warming_up": {"offset": 5.0, "sets_in": 10.0}}
+    data = gripper.model_copy(
+        update={"effects": effects, "catalogue": {"cup": CUP, "lip": LIP, "ice": ICE}}
+    )
+    fmu = make_fmu(Component.of(data, "inside"), "cell 1", "a test", "tests", 3, compiled=False)
+    texts = {name: content.decode() for name, content in parts(fmu).items()}
+    described = texts["modelDescription.xml"]
+    assert "effect.cup.begins" in described
+    assert "effect.lip" not in described
+    assert "left out of the catalogue: lip, ice (no more than 2 mechanisms" in described
+    assert "Left out of the catalogue: lip, ice (no more" in texts["documentation/index.html"]
+    outside = Component.of(data, "outside")  # the cup is somebody else's
+    assert (list(outside.slots), outside.left_out) == (["lip"], ("ice",))
+    assert Component.of(gripper, "inside").remark == ""
+
+
 @pytest.mark.needs("cc")
 def test_steps_may_be_of_any_length() -> None:
     commands = cycles("gripper", 1)  # all edges at 50 ms
@@ -288,7 +402,9 @@ def test_a_state_of_another_fmu_is_refused() -> None:
 @pytest.mark.needs("cc")
 @pytest.mark.parametrize(("version", "where"), ALL)
 def test_sources_compile_without_a_warning(version: int, where: Where, tmp_path: Path) -> None:
-    for name, content in parts(made("gripper", version, where)).items():
+    catalogue = {"lip": LIP, "ice": ICE}
+    data = rigs.config("gripper").data.model_copy(update={"catalogue": catalogue})
+    for name, content in parts(fmus.of_data(data, version, where)).items():
         if name.startswith("sources/"):
             (tmp_path / Path(name).name).write_bytes(content)
     command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-c", f"fmi{version}.c"]

@@ -16,6 +16,7 @@ from twin.files import write_whole
 
 if TYPE_CHECKING:
     from twin.config import Config
+    from twin.exchange.variables import Component
     from twin.settings import Document
 
 
@@ -76,9 +77,9 @@ def export_fmu(
     content = fmu.content
     if target.suffix.lower() == SSP:
         kind = Config.of(document, assets, requested, calibrated=False)
-        content = make_ssp(fmu, name, component, Component.of(kind.data, vessel.value))
+        content = make_ssp(fmu, name, component, component.with_data(kind.data))
     write_whole(target, content)
-    _remark(settings, binary=fmu.binary, is_compiled=not sources_only)
+    _remark(settings, component, binary=fmu.binary, is_compiled=not sources_only)
     print(f"{name} in {target}: FMI {fmi.value}.0, {settings.origin}")
 
 
@@ -108,7 +109,7 @@ def _document(config: Path | None, name: str, assets: str) -> "tuple[Document, s
     return Document("", "", {"asset": asset}), ""
 
 
-def _remark(settings: "Config", *, binary: str, is_compiled: bool) -> None:
+def _remark(settings: "Config", component: "Component", *, binary: str, is_compiled: bool) -> None:
     """Print remarks on the FMU."""
     if settings.instead:
         print(settings.instead, file=sys.stderr)
@@ -118,6 +119,8 @@ def _remark(settings: "Config", *, binary: str, is_compiled: bool) -> None:
             " the FMU",
             file=sys.stderr,
         )
+    if component.remark:
+        print(component.remark, file=sys.stderr)
     if is_compiled:
         text = f"compiled: {binary}" if binary else "no C compiler for this platform: sources alone"
         print(text, file=sys.stderr)

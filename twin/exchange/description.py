@@ -70,9 +70,11 @@ def _factor(factor: float) -> dict[str, str]:
 
 def _common(component: Component, identity: Identity) -> dict[str, str]:
     scope = "with the vessel inside" if component.where == "inside" else "with a port for a vessel"
+    sentences = [WORDS, scope, f"data: {identity.origin}"]
+    sentences += [component.remark] if component.remark else []
     return {
         "modelName": identity.name,
-        "description": f"{WORDS}; {scope}; data: {identity.origin}",
+        "description": "; ".join(sentences),
         "license": LICENSE,
         "generationTool": identity.program,
         "variableNamingConvention": "structured",

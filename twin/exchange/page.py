@@ -33,7 +33,7 @@ Commands set at the beginning of a step hold until its end, so steps should not 
 command may be late.</p>
 <p>{port}</p>
 <p>Effects are what may be wrong with an ejector; where they start it is as the data say. They may
-be changed while time runs, so that a fault can begin, grow or come and go.</p>
+be changed while time runs, so that a fault can begin, grow or come and go.{remark}</p>
 {tables}
 </body>
 </html>
@@ -67,8 +67,13 @@ def page(component: Component, identity: Identity) -> str:
         origin=html.escape(identity.origin),
         program=html.escape(identity.program),
         port=_PORT[component.where],
+        remark=f" {html.escape(_sentence(component.remark))}" if component.remark else "",
         tables="\n".join(tables),
     )
+
+
+def _sentence(remark: str) -> str:
+    return f"{remark[0].upper()}{remark[1:]}."
 
 
 def _table(variables: Iterable[Variable]) -> str:

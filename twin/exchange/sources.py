@@ -9,10 +9,11 @@ from uuid import NAMESPACE_URL, uuid5
 
 from twin.exchange.c_expressions import INDEX, LANE, NUMBER, ROWS, TABLES, WHOLE, literal
 from twin.exchange.translate import Program
-from twin.exchange.variables import Component, Role, Variable, reference
-from twin.model import control, kernel, plant
+from twin.exchange.variables import Component, InSlot, Role, Variable, reference
+from twin.model import control, kernel, mechanism, plant
 from twin.model import theta as c
 from twin.model.control import new_timer, nothing_done
+from twin.model.effects import Effect
 
 # What component.h calls, with the kinds of the arguments.
 _CALLED = (
@@ -23,6 +24,8 @@ _CALLED = (
     (kernel._step, ROWS, ROWS, NUMBER, NUMBER),
     (kernel._read_sensors, ROWS, ROWS, LANE, LANE),
     (kernel.take_over, ROWS, ROWS, ROWS),
+    (kernel._remove_mechanisms, ROWS, INDEX),
+    (kernel._advance_mechanisms, ROWS, ROWS, NUMBER),
 )
 # And the numbers it reads.
 _READ = (
@@ -63,10 +66,7 @@ def _model(component: Component) -> str:
     program = Program()
     for source, *kinds in _CALLED:
         program.function(source, *kinds)
-    effect_functions = [
-        (program.function(effect.act, ROWS, *[NUMBER] * len(effect.parameters)).name, effect)
-        for effect in component.effects
-    ]
+    acts = [line for effect in component.effects for line in _acts(program, component, effect)]
     for module, *names in _READ:
         for name in names:
             program.declarations.constant(module.__name__, name, getattr(module, name))
@@ -75,12 +75,6 @@ def _model(component: Component) -> str:
     assignments = [
         f"    theta[THETA_{name}] = {component.sources[name]};" for name in c.COEFFICIENTS
     ]
-    for function, effect in effect_functions:
-        values = [
-            f"v[{reference(f'effect.{effect.name}.{parameter.name}')}]"
-            for parameter in effect.parameters
-        ]
-        assignments.append(f"    {function}({', '.join(['theta', *values])});")
     return "\n".join(
         [
             f"#define VESSEL_OUTSIDE {int(component.where == 'outside')}",
@@ -94,10 +88,49 @@ def _model(component: Component) -> str:
             "/* Coefficients from values; effects act on them as they do in the twin. */",
             "static void coefficients(const double *v, double *theta) {",
             *assignments,
+            *acts,
             "}",
             "",
         ]
     )
+
+
+def _acts(program: Program, component: Component, effect: Effect) -> list[str]:
+    """The statements by which an effect acts on the coefficients."""
+    values = {
+        parameter.name: f"v[{reference(f'effect.{effect.name}.{parameter.name}')}]"
+        for parameter in effect.parameters
+    }
+    if effect.name in component.slots:
+        return _in_slot(program, component.slots[effect.name], values)
+    function = program.function(effect.act, ROWS, *[NUMBER] * len(values)).name
+    return [f"    {function}({', '.join(['theta', *values.values()])});"]
+
+
+def _in_slot(program: Program, slot: InSlot, values: Mapping[str, str]) -> list[str]:
+    """The same of a mechanism: what ``Mechanism`` does, by the same functions."""
+    acting, first = slot.mechanism, slot.first
+    place = acting.place
+    sizes = zip(place.coefficients, place.si, place.parameters, strict=True)
+    lines = []
+    for where, (coefficient, si, parameter) in zip(
+        (mechanism.ON, mechanism.ALSO_ON), sizes, strict=False
+    ):
+        in_si = program.function(si, ROWS, NUMBER).name
+        limit = program.function(mechanism.limit_of(coefficient), ROWS, WHOLE, NUMBER).name
+        added = f"{in_si}(theta, {values[parameter.name]})"
+        lines += [
+            f"    theta[{first + where}] = {coefficient}.0;",
+            f"    theta[{first + where + 1}] = {limit}(theta, {coefficient}, {added});",
+        ]
+    kinds = (ROWS, WHOLE, *[NUMBER] * 6)
+    function = program.function(mechanism.set_condition, *kinds).name
+    condition = ", ".join(acting.condition(values, "0.0"))
+    return [
+        *lines,
+        f"    theta[{first + mechanism.WHEN}] = {acting.when.code}.0;",
+        f"    {function}(theta, {first}, {condition});",
+    ]
 
 
 def _at_rest() -> str:

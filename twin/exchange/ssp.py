@@ -27,7 +27,7 @@ def make_ssp(fmu: Fmu, name: str, unit: Component, kind: Component) -> bytes:
         {
             "SystemStructure.ssd": _structure(name, resource, unit),
             resource: fmu.content,
-            TYPE: parameter_set(f"{name}: its type", kind.parameters),
+            TYPE: parameter_set(f"{name}: its type", _shared(kind, unit)),
             UNIT: parameter_set(f"{name}: the unit itself", overlay(unit, kind)),
         }
     )
@@ -37,8 +37,16 @@ def overlay(unit: Component, kind: Component) -> Sequence[Variable]:
     """The parameters in which a unit differs from its type."""
     type_start = {parameter.name: parameter.start for parameter in kind.parameters}
     return [
-        parameter for parameter in unit.parameters if parameter.start != type_start[parameter.name]
+        parameter
+        for parameter in unit.parameters
+        if parameter.start != type_start.get(parameter.name)
     ]
+
+
+def _shared(kind: Component, unit: Component) -> Sequence[Variable]:
+    """The parameters of a type that the unit's FMU has as well."""
+    names = {parameter.name for parameter in unit.parameters}
+    return [parameter for parameter in kind.parameters if parameter.name in names]
 
 
 def parameter_set(name: str, parameters: Sequence[Variable]) -> bytes:

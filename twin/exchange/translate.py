@@ -143,8 +143,14 @@ class _Body:
             f"    {declared(self._declarations.type_of(kind), name)};"
             for name, kind in self._locals.items()
         ]
+        used = {name.id for name in _names(self._tree)}
+        unused = [  # compilers warn otherwise
+            f"    (void){name};"
+            for name, kind in self._parameters.items()
+            if kind != INDEX and name not in used
+        ]
         comment = [f"/* {textwrap.indent(docstring, '   ').strip()} */"] if docstring else []
-        return "\n".join([*comment, header, *local_declarations, *body, "}"])
+        return "\n".join([*comment, header, *local_declarations, *unused, *body, "}"])
 
     # --- statements -----------------------------------------------------------------------------
 

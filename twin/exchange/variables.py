@@ -1,16 +1,18 @@
 """The variables of an FMU: ports, settings, effects, and the coefficients of the data set.
 
 The description, the C sources, the page and the parameter sets are made from this one table.
-Effects and coefficients come from the model's own tables.
+Effects and coefficients come from the model's own tables; effects of the data set's catalogue are
+beside them, each in one of the model's slots for mechanisms.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
 
 from twin.exchange.units import plain
+from twin.model.catalogue import CatalogueEffect
 from twin.model.dataset import (
     AIR_SAVING_MODES,
     BLOW_OFF_MODES,
@@ -19,6 +21,7 @@ from twin.model.dataset import (
     coefficients,
 )
 from twin.model.effects import EFFECTS, Effect
+from twin.model.mechanism import SLOTS, WIDTH, Mechanism, free_slots, slot_at
 from twin.model.plant import COLDEST, HIGHEST, HOTTEST, LOWEST
 from twin.model.theta import COEFFICIENTS, Theta
 from twin.signals import Phase
@@ -113,6 +116,19 @@ class Variable:
 
 
 @dataclass(frozen=True)
+class InSlot:
+    """An effect of the catalogue: a mechanism in a slot of the model that is its own."""
+
+    entry: CatalogueEffect
+    first: int  # number of the slot's first coefficient
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What acts."""
+        return self.entry.acts_as
+
+
+@dataclass(frozen=True)
 class Component:
     """The source of an FMU: its variables, and the C expression of each coefficient."""
 
@@ -120,22 +136,39 @@ class Component:
     variables: tuple[Variable, ...]
     sources: Mapping[str, str]  # coefficient -> expression over v, the values
     effects: tuple[Effect, ...]  # in the order in which they act
+    slots: Mapping[str, InSlot]  # of those that are in the catalogue, by name
+    left_out: tuple[str, ...]  # effects of the catalogue for which no slot is free
 
     @classmethod
     def of(cls, data: DataSet, where: Where) -> "Component":
         """The component of a data set; effects start at the sizes in the data set.
 
-        A mechanism that is not in the table of effects is part of the coefficients.
+        A mechanism of the data set is an effect of the catalogue, or part of the coefficients.
         """
-        listed = {name: sizes for name, sizes in data.effects.items() if name in EFFECTS}
-        unlisted = {name: sizes for name, sizes in data.effects.items() if name not in EFFECTS}
-        theta = coefficients(data.model_copy(update={"effects": unlisted}))
-        names = [*listed, *(name for name in EFFECTS if name not in listed)]
-        available = [
-            name for name in names if where == "inside" or not _is_of_vessel(EFFECTS[name])
-        ]
-        effect_variables = _effect_variables(theta, data.effects, available)
-        sources = {**_PORTS, **_VESSEL[where]}
+        catalogue = {
+            name: entry
+            for name, entry in data.catalogue.items()
+            if where == "inside" or not _is_of_vessel(frozenset(entry.acts_as.place.coefficients))
+        }
+        found = _found(data.effects, catalogue)
+        named = found.values()
+        start_values = {
+            found.get(mechanism, mechanism): sizes for mechanism, sizes in data.effects.items()
+        }
+        fixed = {
+            name: sizes
+            for name, sizes in data.effects.items()
+            if name not in EFFECTS and name not in found
+        }
+        theta = coefficients(data.model_copy(update={"effects": fixed}))
+        chosen = [*named, *(name for name in catalogue if name not in named)]
+        slots = {
+            name: InSlot(catalogue[name], slot_at(SLOTS - 1 - number))
+            for number, name in enumerate(chosen[: free_slots(theta)])
+        }
+        effects = _in_order(start_values, where, slots)
+        effect_variables = _effect_variables(theta, start_values, effects)
+        sources = {**_PORTS, **_VESSEL[where], **_of_slots(slots)}
         for variable, number in effect_variables:
             if number is not None:  # it replaces a coefficient
                 sources.setdefault(list(COEFFICIENTS)[number], f"v[{variable.reference}]")
@@ -153,25 +186,88 @@ class Component:
             *(variable for variable, _ in effect_variables),
             *remaining.values(),
         )
-        return cls(where, variables, sources, tuple(EFFECTS[name] for name in available))
+        left_out = tuple(chosen[len(slots) :])
+        return cls(where, variables, sources, tuple(effects.values()), slots, left_out)
 
     @property
     def parameters(self) -> tuple[Variable, ...]:
         """The variables of a parameter set."""
         return tuple(variable for variable in self.variables if variable.is_parameter)
 
+    def with_data(self, data: DataSet) -> "Component":
+        """The component of another data set with the same effects of the catalogue."""
+        catalogue = {name: slot.entry for name, slot in self.slots.items()}
+        return Component.of(data.model_copy(update={"catalogue": catalogue}), self.where)
 
-def _is_of_vessel(effect: Effect) -> bool:
-    """Whether an effect acts on the vessel alone: an FMU without the vessel does not have it."""
-    return {list(COEFFICIENTS)[number] for number in effect.touches} <= _VESSEL["outside"].keys()
+    @property
+    def remark(self) -> str:
+        """What is missing of the catalogue, and why; empty if nothing is."""
+        if not self.left_out:
+            return ""
+        return (
+            f"left out of the catalogue: {', '.join(self.left_out)} (no more than {SLOTS}"
+            " mechanisms act at once)"
+        )
+
+
+def _found(
+    effects: Mapping[str, Mapping[str, float]], catalogue: Mapping[str, CatalogueEffect]
+) -> dict[str, str]:
+    """The catalogue's effects that a data set has, by the name of their mechanism.
+
+    What was found of them is stored as the mechanism. It is the first one whose bounds hold it.
+    """
+    found: dict[str, str] = {}
+    for name, entry in catalogue.items():
+        values = effects.get(entry.mechanism)
+        if values is not None and all(
+            bounds.low <= values.get(parameter, 0.0) <= bounds.high
+            for parameter, bounds in entry.parameters.items()
+        ):
+            found.setdefault(entry.mechanism, name)
+    return found
+
+
+def _in_order(
+    present: Mapping[str, object], where: Where, slots: Mapping[str, InSlot]
+) -> dict[str, Effect]:
+    """The effects of a component: those of the data set act first, in its order."""
+    effects = {
+        name: effect
+        for name, effect in EFFECTS.items()
+        if where == "inside" or not _is_of_vessel(effect.touches)
+    } | {name: slot.entry.effect(name) for name, slot in slots.items()}
+    names = [*(name for name in present if name in effects), *effects]
+    return {name: effects[name] for name in names}
+
+
+def _is_of_vessel(touched: frozenset[int]) -> bool:
+    """Whether what is touched is the vessel alone: an FMU without the vessel does not have it."""
+    return {list(COEFFICIENTS)[number] for number in touched} <= _VESSEL["outside"].keys()
+
+
+def _of_slots(slots: Mapping[str, InSlot]) -> dict[str, str]:
+    """The coefficients of slots that effects fill."""
+    names = list(COEFFICIENTS)
+    return {
+        name: "0.0" for slot in slots.values() for name in names[slot.first : slot.first + WIDTH]
+    }
 
 
 def _effect_variables(
-    theta: Theta, start_values: Mapping[str, Mapping[str, float]], names: Sequence[str]
+    theta: Theta,
+    start_values: Mapping[str, Mapping[str, float]],
+    effects: Mapping[str, Effect],
 ) -> list[tuple[Variable, int | None]]:
-    """The parameters of effects in the table's order, each with the coefficient it replaces."""
+    """The parameters of effects in the table's order, then the catalogue's.
+
+    Each is with the coefficient that it replaces.
+    """
     variables = []
-    for effect in (effect for effect in EFFECTS.values() if effect.name in names):
+    names = [name for name in EFFECTS if name in effects]
+    for effect in (
+        effects[name] for name in [*names, *(name for name in effects if name not in EFFECTS)]
+    ):
         for parameter in effect.parameters:
             start = start_values.get(effect.name, {}).get(parameter.name, parameter.neutral(theta))
             name, unit = f"effect.{effect.name}.{parameter.name}", plain(parameter.unit)

@@ -481,13 +481,19 @@ def _has_mechanism(k: Prepared, i: int) -> bool:
     return False
 
 
-@compiled
-def _apply_mechanisms(state: State, k: Prepared, i: int) -> float:
-    """Put the mechanisms' shares into the coefficients; return the vessel's volume (m³)."""
+@inlined
+def _remove_mechanisms(k: Prepared, i: int) -> None:
+    """Make the coefficients what they are without the mechanisms that change them."""
     for slot in range(SLOTS):
         first, unmoved = c.MECHANISMS + slot * WIDTH, UNMOVED + 2 * slot
         k[int(k[first + ON, i]), i] = k[unmoved, i]
         k[int(k[first + ALSO_ON, i]), i] = k[unmoved + 1, i]
+
+
+@compiled
+def _apply_mechanisms(state: State, k: Prepared, i: int) -> float:
+    """Put the mechanisms' shares into the coefficients; return the vessel's volume (m³)."""
+    _remove_mechanisms(k, i)
     for slot in range(SLOTS):
         first, share = c.MECHANISMS + slot * WIDTH, state[ACTS + slot, i]
         k[int(k[first + ON, i]), i] += share * k[first + SIZE, i]

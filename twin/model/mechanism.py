@@ -7,15 +7,17 @@ from 0 to 1; the coefficient changes by ``SIZE`` times the share. A mechanism ha
 holds for every program of commands.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from twin.errors import ConfigError
 from twin.model import theta as c
 from twin.model.effects import FLATTEST, Effect, Parameter, add_beside
 from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
+
+_Value = TypeVar("_Value", float, str)  # of a parameter: a number, or its expression in C
 
 SLOTS = 2  # number of mechanisms that can act at once
 # Offsets of a mechanism's coefficients from ``c.MECHANISMS`` on; each mechanism has WIDTH of them.
@@ -41,8 +43,9 @@ WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
 class Place:
     """Where a mechanism acts: one or two coefficients, each with a size in the field's unit.
 
-    ``si`` converts a size into the change of its coefficient (SI). ``sentence`` is completed by the
-    sizes and by the condition; ``words`` name the coefficients in a formula.
+    ``si`` converts a size into the change of its coefficient (SI); it is translated into C for
+    FMUs, so it is plain arithmetic. ``sentence`` is completed by the sizes and by the condition;
+    ``words`` name the coefficients in a formula.
     """
 
     name: str
@@ -69,6 +72,52 @@ class When:
     briefly: str = ""  # the sentence without values, if it has some
 
 
+# --- sizes in SI ---------------------------------------------------------------------------------
+
+
+def _flowing(_theta: Theta, flow: float) -> float:
+    return flow * SL_MIN
+
+
+def _seeping(_theta: Theta, flow: float) -> float:
+    return flow * SL_MIN / (600.0 * MBAR)
+
+
+def _less_suction(theta: Theta, loss: float) -> float:
+    return -loss / 100.0 * float(theta[c.SUCTION])
+
+
+def _higher_end(theta: Theta, rise: float) -> float:
+    return rise * MBAR / float(theta[c.AMBIENT_NOMINAL])
+
+
+def _less_supply(_theta: Theta, drop: float) -> float:
+    return -drop * BAR
+
+
+def _less_blow_off(theta: Theta, loss: float) -> float:
+    return -loss / 100.0 * float(theta[c.BLOW_OFF])
+
+
+def _yielding(_theta: Theta, volume: float) -> float:
+    return volume * ML
+
+
+def _narrower(theta: Theta, drop: float) -> float:
+    more = c.resistance(theta, abs(drop) * MBAR)
+    return -more if drop < 0.0 else more
+
+
+def _film(_theta: Theta, film: float) -> float:
+    return film
+
+
+def _offset(_theta: Theta, offset: float) -> float:
+    return offset * MBAR
+
+
+# --- the grammar ---------------------------------------------------------------------------------
+
 _P = Parameter
 _BEGINS = _P("begins", "mbar", 20.0, 900.0, 40.0)
 _BELOW = _P("ends_below", "mbar", 1.0, 400.0, 2.0, ratio=True)
@@ -84,7 +133,7 @@ PLACES = {
             "inflow",
             (c.INFLOW,),
             (_P("flow", "sl/min", -30.0, 60.0, 1.0),),
-            (lambda _, flow: flow * SL_MIN,),
+            (_flowing,),
             "air or vapour flows into the vacuum side at a rate of its own",
             ("inflow",),
         ),
@@ -92,7 +141,7 @@ PLACES = {
             "opening",
             (c.LEAK,),
             (_P("sonic_flow", "sl/min", -30.0, 60.0, 1.0),),
-            (lambda _, flow: flow * SL_MIN,),
+            (_flowing,),
             "an opening to ambient on the vacuum side",
             ("opening",),
         ),
@@ -100,7 +149,7 @@ PLACES = {
             "seepage",
             (c.LAMINAR_LEAK,),
             (_P("flow_at_600mbar", "sl/min", -30.0, 60.0, 1.0),),
-            (lambda _, flow: flow * SL_MIN / (600.0 * MBAR),),
+            (_seeping,),
             "air seeps in, the more the higher the vacuum",
             ("seepage",),
         ),
@@ -108,7 +157,7 @@ PLACES = {
             "suction",
             (c.SUCTION,),
             (_P("loss", "%", -50.0, 90.0, 10.0),),
-            (lambda theta, loss: -loss / 100.0 * float(theta[c.SUCTION]),),
+            (_less_suction,),
             "the ejector moves less air",
             ("suction capacity",),
         ),
@@ -116,7 +165,7 @@ PLACES = {
             "end_pressure",
             (c.END_RATIO,),
             (_P("end_pressure_rise", "mbar", -200.0, 600.0, 20.0),),
-            (lambda theta, rise: rise * MBAR / float(theta[c.AMBIENT_NOMINAL]),),
+            (_higher_end,),
             "the highest vacuum that the ejector can reach is lower",
             ("end pressure",),
         ),
@@ -128,8 +177,8 @@ PLACES = {
                 _P("end_pressure_rise", "mbar", -200.0, 600.0, 20.0),
             ),
             (
-                lambda theta, loss: -loss / 100.0 * float(theta[c.SUCTION]),
-                lambda theta, rise: rise * MBAR / float(theta[c.AMBIENT_NOMINAL]),
+                _less_suction,
+                _higher_end,
             ),
             "the nozzle gives less: the ejector moves less air and reaches less vacuum",
             ("suction capacity", "end pressure"),
@@ -138,7 +187,7 @@ PLACES = {
             "supply",
             (c.SUPPLY,),
             (_P("drop", "bar", -2.0, 4.0, 0.4),),
-            (lambda _, drop: -drop * BAR,),
+            (_less_supply,),
             "the operating pressure is lower",
             ("operating pressure",),
         ),
@@ -146,7 +195,7 @@ PLACES = {
             "blow_off",
             (c.BLOW_OFF,),
             (_P("loss", "%", -100.0, 95.0, 20.0),),
-            (lambda theta, loss: -loss / 100.0 * float(theta[c.BLOW_OFF]),),
+            (_less_blow_off,),
             "the blow-off flow is smaller",
             ("blow-off flow",),
         ),
@@ -154,7 +203,7 @@ PLACES = {
             "volume",
             (c.COMPLIANCE,),
             (_P("volume_at_full_vacuum", "ml", -100.0, 1000.0, 10.0),),
-            (lambda _, volume: volume * ML,),
+            (_yielding,),
             "the volume gives way under vacuum",
             ("volume that gives way",),
         ),
@@ -162,7 +211,7 @@ PLACES = {
             "line",
             (c.RESISTANCE,),
             (_P("pressure_drop_at_nominal", "mbar", -400.0, 800.0, 40.0),),
-            (lambda theta, drop: math.copysign(c.resistance(theta, abs(drop) * MBAR), drop),),
+            (_narrower,),
             "the line between ejector and vessel is narrower",
             ("pressure drop of the line",),
         ),
@@ -170,7 +219,7 @@ PLACES = {
             "heat",
             (c.FILM,),
             (_P("film_coefficient", "W/(m²·K)", -100.0, 300.0, 5.0),),
-            (lambda _, film: film,),
+            (_film,),
             "heat passes faster between gas and wall",
             ("heat transfer",),
         ),
@@ -178,7 +227,7 @@ PLACES = {
             "sensor",
             (c.SENSOR_OFFSET,),
             (_P("offset", "mbar", -200.0, 200.0, 8.0),),
-            (lambda _, offset: offset * MBAR,),
+            (_offset,),
             "the pressure sensor reads too high",
             ("sensor offset",),
         ),
@@ -377,18 +426,53 @@ class Mechanism:
         by_name = dict(
             zip((parameter.name for parameter in self.effect.parameters), values, strict=True)
         )
-        sets_in = by_name.get("sets_in", 0.0)
-        begin = by_name.get("begins", 0.0)
         for where, (coefficient, si, value) in zip((ON, ALSO_ON), sizes, strict=False):
             theta[first + where] = coefficient
-            theta[first + where + 1] = _limited(theta, coefficient, si(theta, value))
+            theta[first + where + 1] = limit_of(coefficient)(theta, coefficient, si(theta, value))
         theta[first + WHEN] = self.when.code
-        theta[first + BEGINS] = begin * MBAR
-        theta[first + ENDS] = max(begin - by_name.get("ends_below", 0.0), 1.0) * MBAR
-        theta[first + SETS_IN] = sets_in
-        theta[first + FADES] = by_name.get("fades", sets_in)
-        theta[first + PERIOD] = by_name.get("period", 1.0)
-        theta[first + SHIFT] = by_name.get("shift", 0.0)
+        set_condition(theta, first, *self.condition(by_name, 0.0))
+
+    def condition(self, values: Mapping[str, _Value], zero: _Value) -> tuple[_Value, ...]:
+        """Last arguments of ``set_condition``; ``zero`` where it has no such parameter.
+
+        What has no fading time of its own fades as it sets in.
+        """
+        sets_in = values.get("sets_in", zero)
+        return (
+            values.get("begins", zero),
+            values.get("ends_below", zero),
+            sets_in,
+            values.get("fades", sets_in),
+            values.get("period", zero),
+            values.get("shift", zero),
+        )
+
+
+def set_condition(
+    theta: Theta,
+    first: int,
+    begins: float,
+    ends_below: float,
+    sets_in: float,
+    fades: float,
+    period: float,
+    shift: float,
+) -> None:
+    """Set the levels (mbar) and times (s) of the slot at ``first``; a period of 0 is none.
+
+    Plain arithmetic: it is translated into C for FMUs.
+    """
+    theta[first + BEGINS] = begins * MBAR
+    theta[first + ENDS] = max(begins - ends_below, 1.0) * MBAR
+    theta[first + SETS_IN] = sets_in
+    theta[first + FADES] = fades
+    theta[first + PERIOD] = period if period > 0.0 else 1.0
+    theta[first + SHIFT] = shift
+
+
+def slot_at(number: int) -> int:
+    """Index of the first coefficient of a slot, which count from 0."""
+    return c.MECHANISMS + number * WIDTH
 
 
 def _free_slots(theta: Theta) -> Iterator[int]:
@@ -403,12 +487,27 @@ def free_slots(theta: Theta) -> int:
     return sum(1 for _ in _free_slots(theta))
 
 
-def _limited(theta: Theta, coefficient: int, added: float) -> float:
-    """``added``, limited so that no flow, share or volume is negative and no cup vanishes."""
-    present = float(theta[coefficient])
+Limit = Callable[[Theta, int, float], float]  # of the change of a coefficient (SI)
+
+
+def limit_of(coefficient: int) -> Limit:
+    """What limits a change: no flow, share or volume is negative, and no cup vanishes."""
     if coefficient == c.COMPLIANCE:
-        added = min(added, FLATTEST * float(theta[c.VOLUME]) - present)
-    return added if coefficient in _SIGNED else max(added, -present)
+        return _some_volume_left
+    return _any_change if coefficient in _SIGNED else _not_negative
+
+
+def _any_change(_theta: Theta, _coefficient: int, added: float) -> float:
+    return added
+
+
+def _not_negative(theta: Theta, coefficient: int, added: float) -> float:
+    return max(added, -float(theta[coefficient]))
+
+
+def _some_volume_left(theta: Theta, coefficient: int, added: float) -> float:
+    room = FLATTEST * float(theta[c.VOLUME]) - float(theta[coefficient])
+    return max(min(added, room), -float(theta[coefficient]))
 
 
 def _value_text(parameter: Parameter, values: Mapping[str, float]) -> str:

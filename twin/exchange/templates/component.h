@@ -87,13 +87,16 @@ static void component_rest(struct Component *c) {
     component_outputs(c, 0.0);
 }
 
-/* Go on under values that were set meanwhile. */
+/* Go on under values that were set meanwhile. Coefficients before and after are compared without
+   the mechanisms that change them. */
 static void component_take_over(struct Component *c) {
     double before[PLANT_PREPARED];
     memcpy(before, c->k, sizeof before);
+    kernel_remove_mechanisms(before);
     coefficients(c->values, c->k);
     plant_prepare_one(c->k);
     kernel_take_over(c->state, before, c->k);
+    kernel_advance_mechanisms(c->state, c->k, 0.0);
     c->changed = 0.0;
 }
 
