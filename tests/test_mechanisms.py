@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,15 @@ from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.extend import extended, nothing, remarks
+from twin.diagnosis.mechanism_picture import _elapsed, inferred
 from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
+from twin.diagnosis.pictures import Found
 from twin.diagnosis.propose import Proposal, _range, proposed
+from twin.diagnosis.report import _law_holds, draw, write_report
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
+from twin.languages.choice import language_of
+from twin.languages.texts import speaking
 from twin.live import Twin
 from twin.log.recorder import Recorder
 from twin.model import kernel
@@ -42,7 +48,7 @@ from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply, effect_of
 from twin.model.theta import Theta
 from twin.settings import Document
-from twin.signals import MBAR, Command, Samples
+from twin.signals import MBAR, Command, Phase, Samples
 
 FIVE = battery_first.UNLISTED  # the mechanisms that the seeds below were drawn from
 ROWS = 7000
@@ -379,12 +385,19 @@ def test_three_listed_causes_that_mimic_one_mechanism_are_dropped() -> None:
     assert answer["gain"]["share_of_achievable_pct"] > 90.0
 
 
+@cache
+def lifted() -> tuple[battery_first.Hidden, Diagnosis]:
+    """A gripper's lip that lifts off at 530 mbar of vacuum and lets air in."""
+    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900000, 2, mechanisms=FIVE)
+    assert hidden.effect == "lip_lift"
+    return hidden, diagnose(unit.config, [samples], "lip.mcap", lambda _: None)
+
+
 @pytest.mark.slow
 def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
     """A porous leak explains a lip that lifts to 4.8 mbar; healthy cycles have 2.8."""
-    unit, (hidden,), samples = battery_first.drawn_case("unlisted", 900000, 2, mechanisms=FIVE)
-    assert hidden.effect == "lip_lift"
-    answer = diagnose(unit.config, [samples], "lip.mcap", lambda _: None).json
+    hidden, diagnosis = lifted()
+    answer = diagnosis.json
     assert (answer["verdict"], answer["causes"]) == ("unlisted", [])
     mechanism = answer["unlisted"]["mechanism"]
     # Fitted from 20 starts each, an opening, an inflow and a seepage above 530 mbar are within 0.6
@@ -396,3 +409,79 @@ def test_one_listed_cause_that_mimics_a_mechanism_is_dropped() -> None:
     assert any(sentence.startswith("Air seeps in") for sentence in alike)
     assert any(sentence.startswith("Air or vapour flows") for sentence in alike)
     assert not any("gathers over" in sentence for sentence in alike)
+
+
+# --- its picture ----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_held_out_cycles_show_a_flow_where_the_lip_is_off_and_none_below() -> None:
+    _, diagnosis = lifted()
+    found = inferred(Found.of(diagnosis))
+    (size,) = found.sizes
+    begins = diagnosis.acting[-1].values["begins"]
+    above = size.x > begins
+    assert np.array_equal(size.law[above], np.ones(np.count_nonzero(above)))
+    assert size.y[above] == pytest.approx(size.value, rel=0.15)
+    assert size.y[~above] == pytest.approx(0.0, abs=3.0 * size.sigma[~above].max())
+    within, count = found.agreeing
+    assert 4 <= count == len(size.x)
+    assert within >= count - 1
+
+
+@pytest.mark.slow
+def test_the_dots_follow_the_log_and_not_the_law() -> None:
+    """Of a law that is half as large they still show the whole; the title says that."""
+    _, diagnosis = lifted()
+    found = Found.of(diagnosis)
+    (whole,) = inferred(found).sizes
+    cause = found.causes[-1]
+    halved = replace(cause, values={**cause.values, whole.parameter: whole.value / 2.0})
+    half = inferred(replace(found, causes=(*found.causes[:-1], halved)))
+    (size,) = half.sizes
+    above = size.x > cause.values["begins"]
+    assert size.y[above][-1] == pytest.approx(whole.y[-1], rel=0.15)
+    assert not size.agrees[above][-1]
+    assert _law_holds(half).startswith("Held-out cycles show another law")
+
+
+@pytest.mark.slow
+def test_ice_is_shown_over_the_time_for_which_the_nozzle_has_run() -> None:
+    _, _, diagnosis = iced()
+    shown = draw(diagnosis, "mechanism")
+    assert shown.title.startswith("The law holds on held-out cycles: ")
+    axes = shown.picture.axes[0]
+    assert axes.get_ylabel() == "suction capacity:\nloss (%)"
+    assert "nozzle has run in the cycle (s)" in str(shown.picture._supxlabel.get_text())  # type: ignore[attr-defined]
+    found = inferred(Found.of(diagnosis))
+    size = found.sizes[0]
+    assert size.y[-1] > size.y[0] > 0.0  # it grows
+    assert size.x[-1] < np.nanmax(found.x) < 3.0
+    with speaking(language_of("de", "language")):
+        assert draw(diagnosis, "mechanism").title.startswith("Das Gesetz gilt an zurück")
+
+
+@pytest.mark.slow
+def test_a_report_has_the_picture_of_a_mechanism_and_an_answer_without_one_has_none(
+    tmp_path: Path,
+) -> None:
+    _, _, diagnosis = iced()
+    write_report(diagnosis, tmp_path / "ice.html")
+    assert "Dots: what the held-out cycles" in (tmp_path / "ice.html").read_text(encoding="utf-8")
+    curve = {**diagnosis.json, "unlisted": {**diagnosis.json["unlisted"], "mechanism": None}}
+    with pytest.raises(ConfigError, match="has no picture 'mechanism'"):
+        draw(replace(diagnosis, json=curve, mechanism=None), "mechanism")
+
+
+def test_time_is_counted_anew_where_a_jet_or_a_cycle_begins() -> None:
+    evidence, _ = swung()
+    runs = evidence.ticks["phase"] == Phase.SUCTION
+    jet, _ = _elapsed(evidence, m.NOZZLE_ON)
+    off, _ = _elapsed(evidence, m.NOZZLE_OFF)
+    assert np.array_equal(np.isfinite(jet), runs)
+    assert np.array_equal(np.isfinite(off), ~runs)
+    for begin, end in pairwise(evidence.starts):
+        in_cycle = jet[begin:end][runs[begin:end]]
+        assert in_cycle[0] < 0.0015
+        assert in_cycle[-1] == pytest.approx((len(in_cycle) - 1) * 0.001, abs=0.002)
+    assert np.nanmax(off) < 2.0

@@ -379,7 +379,7 @@ class Answer:
         return list(self.json["causes"])
 
     def plot(self, picture: str = "cycle") -> Picture:
-        """Draw a picture of the report (mbar, ms): cycle, log, phases, left or ranking.
+        """Draw a picture of the report (mbar, ms): cycle, log, phases, left, mechanism or ranking.
 
         ConfigError for another name, or if this answer has no such picture.
         """

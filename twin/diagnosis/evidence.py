@@ -213,6 +213,30 @@ class Evidence:
         sensing = self._sensing(bases, courses)
         if late is not None:
             sensing = [_later(*pair) for pair in zip(sensing, late, strict=True)]
+        return self._off(courses, sensing, bases)
+
+    def off_where(
+        self,
+        hypothesis: Hypothesis,
+        rows: Sequence[npt.NDArray[np.bool_]],
+        change: Callable[[Theta], Theta],
+    ) -> Floats:
+        """As ``off``, with coefficients that ``change`` moves in some rows, (bins, len(rows)).
+
+        The air saving is seen to switch as without the change.
+        """
+        course = self.course(hypothesis)
+        sensing = self._sensing([self.theta], [course]) * len(rows)
+        courses = [_changed_where(course, chosen, change) for chosen in rows]
+        return self._off(courses, sensing, [self.theta] * len(rows))
+
+    def _off(
+        self,
+        courses: Sequence[Schedule],
+        sensing: Sequence[tuple["Sensing", ...]],
+        bases: Sequence[Theta],
+    ) -> Floats:
+        """Measured minus expected pressure (mbar) in each bin, (bins, courses)."""
         lanes = [slice(i, i + kernel.LANES) for i in range(0, len(courses), kernel.LANES)]
 
         def run(lane: slice) -> Floats:
@@ -229,6 +253,25 @@ class Evidence:
         for lane, off in zip(lanes, at_once(run, lanes), strict=True):
             deviations[:, lane] = off
         return deviations
+
+    def states(self, hypothesis: Hypothesis, rows: Ints) -> Floats:
+        """The model's state after each of some ascending rows, (kernel.STATE, rows)."""
+        course = self.course(hypothesis)
+        sensing, every = self._sensing([self.theta], [course]), np.arange(len(self.samples))
+        phase, level = self._phases(sensing), self._levels(every, [course], sensing)
+        dt, expected = np.diff(self._times, prepend=0.0), np.empty((len(every), 1))
+        state, before, states = kernel.new_state(1), None, list[Floats]()
+        for first, last, theta in _constant_stretches([course], len(every)):
+            if before is not None:
+                kernel.take_over(state, before, theta)
+            before = theta
+            inside = rows[(rows >= first) & (rows < last)]
+            for begin, end in pairwise(np.unique([first, *(inside + 1), last])):
+                part = slice(begin, end)
+                kernel.advance(state, theta, dt[part], phase[part], level[part], expected[part])
+                if end - 1 in inside:
+                    states.append(state[:, 0].copy())
+        return np.array(states).T
 
     @cached_property
     def left_open(self) -> LeftOpen:
@@ -469,6 +512,16 @@ def _later(sensing: tuple[Sensing, ...], rows: int) -> tuple[Sensing, ...]:
         return sensing
     shifts = sensing or (Sensing(0, 0, 0, 0.0, 0.0),)
     return tuple(replace(shift, off=shift.off - rows, on=shift.on - rows) for shift in shifts)
+
+
+def _changed_where(
+    course: Schedule, chosen: npt.NDArray[np.bool_], change: Callable[[Theta], Theta]
+) -> Schedule:
+    """A course whose coefficients are changed in the chosen rows."""
+    begins = [row for row, _ in course]
+    rows = {*begins, *(np.flatnonzero(np.diff(chosen)) + 1).tolist()}
+    at = [(row, course[int(np.searchsorted(begins, row, "right")) - 1][1]) for row in sorted(rows)]
+    return [(row, change(theta) if chosen[row] else theta) for row, theta in at]
 
 
 def _constant_stretches(courses: Sequence[Schedule], rows: int) -> Iterator[tuple[int, int, Theta]]:

@@ -11,6 +11,7 @@ from twin.diagnosis import page
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.drawing import Picture
 from twin.diagnosis.log_picture import draw_log
+from twin.diagnosis.mechanism_picture import Inferred, draw_mechanism, inferred
 from twin.diagnosis.phase_pictures import (
     Laid,
     acting,
@@ -61,6 +62,8 @@ from twin.model.theta import Theta
 from twin.signals import BAR, MBAR, ML, SL_MIN
 
 Clock = Callable[[], int]  # UTC, ns
+
+HOLDS = 0.75  # share of the dots within 95 % of a law that holds; fewer where the twin is coarse
 
 # Colour, mark and text of each verdict's banner.
 BANNER = {
@@ -118,7 +121,7 @@ def _page(diagnosis: Diagnosis) -> str:
         parts.append(page.section(tr("The log"), page.pairs(_cycles(answer))))
     else:
         diagnosed = Found.of(diagnosis)
-        shown = [PICTURES[name](diagnosed, times) for name in _of_verdict(answer)]
+        shown = [PICTURES[name](diagnosed, times) for name in _names(diagnosis)]
         parts += [page.picture(s.title, s.picture, s.caption) for s in shown]
         parts.append(page.section(tr("Numbers"), "\n".join(_tables(answer, times))))
     return page.PAGE.substitute(
@@ -187,7 +190,7 @@ def draw(diagnosis: Diagnosis, name: str) -> Shown:
     """
     if name not in PICTURES:
         raise ConfigError(f"no picture is called {name!r}", known_names(name, PICTURES))
-    pictures = _of_verdict(diagnosis.json)
+    pictures = _names(diagnosis)
     if name not in pictures:
         verdict = diagnosis.json["verdict"]
         raise ConfigError(
@@ -198,11 +201,13 @@ def draw(diagnosis: Diagnosis, name: str) -> Shown:
     return PICTURES[name](Found.of(diagnosis), times)
 
 
-def _of_verdict(answer: Answer) -> list[str]:
+def _names(diagnosis: Diagnosis) -> list[str]:
     """Names of the pictures that an answer has."""
+    answer = diagnosis.json
     if answer["verdict"] == "insufficient":
         return []
     left = ["left"] if answer["unlisted"] else []
+    left += ["mechanism"] if diagnosis.mechanism else []
     ranking = ["ranking"] if answer["verdict"] != "consistent" else []
     return ["cycle", "log", "phases", *left, *ranking]
 
@@ -268,6 +273,43 @@ def _left_picture(diagnosed: Found, _times: Times) -> Shown:
     return Shown(title, draw_left(diagnosed, laid, f"{title}. {alt}"), caption)
 
 
+def _mechanism_picture(diagnosed: Found, _times: Times) -> Shown:
+    found = inferred(diagnosed)
+    title = _law_holds(found)
+    words = listed([tr(size.word) for size in found.sizes])
+    alt = tr("{sizes} over {driver}, by the law and refitted.", sizes=words, driver=found.driver)
+    caption = tr(
+        "Line: the fitted law. Dots: what the held-out cycles {cycles} show. In each range of"
+        " the axis the size may differ from the law, in all of them at once. Where the pressure"
+        " hardly shows the size there is no dot.",
+        cycles=some(diagnosed.numbers(diagnosed.held_out)),
+    )
+    if found.levels is not None:
+        ways = tr("Upwards it begins at the higher vacuum, downwards it ends at the lower one.")
+        caption = f"{caption} {ways}"
+    if len(found.sizes) > 1:
+        each = tr("Each size is refitted with the other as in the law.")
+        caption = f"{caption} {each}"
+    return Shown(title, draw_mechanism(found, f"{title}. {alt}"), caption)
+
+
+def _law_holds(found: Inferred) -> str:
+    within, count = found.agreeing
+    if not count:
+        return tr("Held-out cycles do not show whether the law holds everywhere")
+    if within < HOLDS * count:
+        return tr(
+            "Held-out cycles show another law: only {within} of {count} dots are within 95 %",
+            within=within,
+            count=count,
+        )
+    return tr(
+        "The law holds on held-out cycles: {within} of {count} dots are within 95 %",
+        within=within,
+        count=count,
+    )
+
+
 def _ranking_picture(diagnosed: Found, _times: Times) -> Shown:
     title = _ranked(diagnosed.answer)
     alt = tr("Sigmas left by each cause that was fitted, best first.")
@@ -283,6 +325,7 @@ PICTURES: Mapping[str, Callable[[Found, Times], Shown]] = {
     "log": _log_picture,
     "phases": _phases_picture,
     "left": _left_picture,
+    "mechanism": _mechanism_picture,
     "ranking": _ranking_picture,
 }
 
