@@ -26,7 +26,7 @@ from second_world.rig import Rig
 from twin.calibration.commission import guessed
 from twin.calibration.readings import read
 from twin.model.dataset import coefficients
-from twin.monitor.detector_window import as_wide_as_needed, expected_knees
+from twin.monitor.detector_window import expected_detector, select_window
 from twin.monitor.offline_switching import noise_of, switchings
 from twin.monitor.switching_detector import PhaseFinder
 from twin.signals import MS, NS, Phase, Reported, Samples
@@ -112,8 +112,8 @@ def found_by_old(samples: Samples, logged: Record) -> list[Switch]:
     """Switchings by the live twin's finder, with the data that a commissioning begins with."""
     readings = read(samples)
     data, _ = guessed(config_of(logged.truth.readable).data, readings)
-    knees = as_wide_as_needed(expected_knees(coefficients(data), readings.noise), [samples])
-    finder = PhaseFinder(knees)
+    detector = select_window(expected_detector(coefficients(data), readings.noise), [samples])
+    finder = PhaseFinder(detector)
     phase = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
     seconds = (samples["time_ns"] - samples["time_ns"][0]) * NS
     inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))

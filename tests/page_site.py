@@ -14,7 +14,7 @@ from twin.alarms.limit_changes import LimitChanges
 from twin.alarms.limits import UnitLimits
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.writer import Keeper
+from twin.alarms.writer import AlarmWriter
 from twin.assets.unit import Unit
 from twin.config import Config
 from twin.events import Event, Kind
@@ -57,10 +57,12 @@ class Run:
     def __post_init__(self) -> None:
         document, asset = self.config.document, self.config.asset
         path = Path(document.name).parent / "alarms.sqlite"
-        keeper = Keeper(lambda: open_store(path), Unit(asset.type, asset.id), pytest.fail)
-        before = keeper.begin()
-        self.alarms = Alarms(board_rules(document), self.clock, before, keeper)
-        self.limits = LimitChanges(UnitLimits.of(self.config), keeper, self.clock)
+        alarm_writer = AlarmWriter(
+            lambda: open_store(path), Unit(asset.type, asset.id), pytest.fail
+        )
+        before = alarm_writer.begin()
+        self.alarms = Alarms(board_rules(document), self.clock, before, alarm_writer)
+        self.limits = LimitChanges(UnitLimits.of(self.config), alarm_writer, self.clock)
         ring = folder_of(document, asset) / RING
         self.live = LiveRows(ring, AMBIENT, pytest.fail, self.clock)
 

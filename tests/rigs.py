@@ -15,10 +15,10 @@ from twin.events import Event, Kind
 from twin.live import Twin, run
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
-from twin.monitor.detector_window import expected_knees
+from twin.monitor.detector_window import expected_detector
 from twin.monitor.isolation import Isolation
 from twin.monitor.monitor import Monitor
-from twin.monitor.switching_detector import Knees
+from twin.monitor.switching_detector import DetectorSettings
 from twin.quality import Quality
 from twin.settings import Document
 from twin.signals import MBAR, Samples, Ticks
@@ -42,8 +42,8 @@ def theta(name: str) -> Theta:
 
 
 @cache
-def knees(name: str) -> Knees:
-    return expected_knees(theta(name), config(name).data.sensor.noise_mbar * MBAR)
+def detector(name: str) -> DetectorSettings:
+    return expected_detector(theta(name), config(name).data.sensor.noise_mbar * MBAR)
 
 
 def twin(name: str) -> Twin:

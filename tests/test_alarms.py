@@ -15,7 +15,7 @@ from twin.alarms.advice import action_of
 from twin.alarms.board import Board, Diary, Episode
 from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
-from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
+from twin.alarms.state import SECOND_NS, Alarm, AlarmAction, Change, State
 from twin.alarms.watch import NAMES, deviating, values
 from twin.errors import ConfigError
 from twin.events import Event, Kind
@@ -29,8 +29,8 @@ def leak(**given: object) -> Rule:
     return Rule.model_validate({"name": "leak", "value": "leakage", "above": 250.0} | given)
 
 
-def deeds(changes: list[Change]) -> list[Deed]:
-    return [change.deed for change in changes]
+def deeds(changes: list[Change]) -> list[AlarmAction]:
+    return [change.action for change in changes]
 
 
 def episodes(changes: Iterable[Change]) -> list[Episode]:
@@ -41,10 +41,10 @@ def episodes(changes: Iterable[Change]) -> list[Episode]:
     return list(found.values())
 
 
-def seen(alarm: Alarm, *values: tuple[float, float]) -> list[tuple[float, Deed]]:
+def seen(alarm: Alarm, *values: tuple[float, float]) -> list[tuple[float, AlarmAction]]:
     """Show values at times (s); gives when what happened."""
     changes = [change for time, value in values for change in alarm.see(round(time * S), value)]
-    return [(change.time_ns / S, change.deed) for change in changes]
+    return [(change.time_ns / S, change.action) for change in changes]
 
 
 # One alarm.
@@ -54,13 +54,13 @@ def test_an_alarm_is_raised_acknowledged_and_cleared() -> None:
     alarm = Alarm(leak())
     assert alarm.state is State.NORMAL
     (raised,) = alarm.see(S, 251.0)
-    assert raised == Change(S, "leak", Deed.RAISED, "", announced=True)
+    assert raised == Change(S, "leak", AlarmAction.RAISED, "", announced=True)
     assert alarm.state is State.UNACKNOWLEDGED
     (acknowledged,) = alarm.acknowledge(2 * S, "ann")
-    assert acknowledged == Change(2 * S, "leak", Deed.ACKNOWLEDGED, "ann")
+    assert acknowledged == Change(2 * S, "leak", AlarmAction.ACKNOWLEDGED, "ann")
     assert alarm.state is State.ACKNOWLEDGED
     assert deeds(list(alarm.acknowledge(3 * S, "bob"))) == []
-    assert seen(alarm, (4, 250.0)) == [(4, Deed.CLEARED)]
+    assert seen(alarm, (4, 250.0)) == [(4, AlarmAction.CLEARED)]
     assert alarm.state is State.NORMAL
 
 
@@ -77,42 +77,44 @@ def test_what_has_gone_unseen_stands_until_it_is_acknowledged() -> None:
 def test_a_limit_below() -> None:
     alarm = Alarm(Rule(name="supply_low", value="supply", below=3.0, dead_band=0.2))
     found = seen(alarm, (1, 3.0), (2, 2.9), (3, 3.1), (4, 3.2))
-    assert found == [(2, Deed.RAISED), (4, Deed.CLEARED)]
+    assert found == [(2, AlarmAction.RAISED), (4, AlarmAction.CLEARED)]
 
 
 def test_the_dead_band_holds_an_alarm() -> None:
     alarm = Alarm(leak(dead_band=20.0))
     found = seen(alarm, (1, 251.0), (2, 249.0), (3, 231.0), (4, 230.0), (5, 249.0), (6, 251.0))
-    assert found == [(1, Deed.RAISED), (4, Deed.CLEARED), (6, Deed.RAISED)]
+    assert found == [(1, AlarmAction.RAISED), (4, AlarmAction.CLEARED), (6, AlarmAction.RAISED)]
 
 
 def test_delays_need_the_value_to_stay() -> None:
     alarm = Alarm(leak(on_delay_s=3.0, off_delay_s=5.0))
     assert seen(alarm, (0, 300.0), (2, 300.0), (2.5, 100.0), (3, 300.0), (5.9, 300.0)) == []
-    assert seen(alarm, (6, 300.0), (7, 100.0), (11, 100.0), (11.5, 300.0)) == [(6, Deed.RAISED)]
-    assert seen(alarm, (12, 100.0), (16.9, 100.0), (17, math.nan)) == [(17, Deed.CLEARED)]
+    assert seen(alarm, (6, 300.0), (7, 100.0), (11, 100.0), (11.5, 300.0)) == [
+        (6, AlarmAction.RAISED)
+    ]
+    assert seen(alarm, (12, 100.0), (16.9, 100.0), (17, math.nan)) == [(17, AlarmAction.CLEARED)]
 
 
 def test_a_clock_set_back_begins_a_delay_anew() -> None:
     alarm = Alarm(leak(on_delay_s=3.0))
     assert seen(alarm, (100, 300.0), (10, 300.0), (12.9, 300.0)) == []
-    assert seen(alarm, (13, 300.0)) == [(13, Deed.RAISED)]
+    assert seen(alarm, (13, 300.0)) == [(13, AlarmAction.RAISED)]
 
 
 def test_a_latching_alarm_stands_until_it_is_acknowledged() -> None:
     alarm = Alarm(leak(latching=True))
-    assert seen(alarm, (1, 300.0), (2, 100.0), (99, 100.0)) == [(1, Deed.RAISED)]
+    assert seen(alarm, (1, 300.0), (2, 100.0), (99, 100.0)) == [(1, AlarmAction.RAISED)]
     assert alarm.state is State.UNACKNOWLEDGED
     changes = list(alarm.acknowledge(100 * S, "ann"))
-    assert deeds(changes) == [Deed.ACKNOWLEDGED, Deed.CLEARED]
+    assert deeds(changes) == [AlarmAction.ACKNOWLEDGED, AlarmAction.CLEARED]
     assert alarm.state is State.NORMAL
 
 
 def test_a_latching_alarm_that_is_acknowledged_goes_when_its_cause_does() -> None:
     alarm = Alarm(leak(latching=True))
     seen(alarm, (1, 300.0))
-    assert deeds(list(alarm.acknowledge(2 * S, "ann"))) == [Deed.ACKNOWLEDGED]
-    assert seen(alarm, (3, 100.0)) == [(3, Deed.CLEARED)]
+    assert deeds(list(alarm.acknowledge(2 * S, "ann"))) == [AlarmAction.ACKNOWLEDGED]
+    assert seen(alarm, (3, 100.0)) == [(3, AlarmAction.CLEARED)]
 
 
 def test_shelving_ends_by_itself_and_what_stands_is_announced_then() -> None:
@@ -122,7 +124,7 @@ def test_shelving_ends_by_itself_and_what_stands_is_announced_then() -> None:
     assert (raised.announced, alarm.state) == (False, State.SHELVED)
     assert list(alarm.see(59 * S, 300.0)) == []
     (unshelved,) = alarm.see(60 * S, 300.0)
-    assert (unshelved.deed, unshelved.announced) == (Deed.UNSHELVED, True)
+    assert (unshelved.action, unshelved.announced) == (AlarmAction.UNSHELVED, True)
     assert alarm.state is State.UNACKNOWLEDGED
 
 
@@ -133,17 +135,17 @@ def test_shelving_has_a_longest_time() -> None:
             list(alarm.shelve(0, seconds, "ann"))
     list(alarm.shelve(1000 * S, 600.0, "ann"))
     list(alarm.see(10 * S))  # the clock was set back
-    assert deeds(list(alarm.see(610 * S))) == [Deed.UNSHELVED]
+    assert deeds(list(alarm.see(610 * S))) == [AlarmAction.UNSHELVED]
 
 
 def test_out_of_service_lasts_until_somebody_ends_it() -> None:
     alarm = Alarm(leak())
-    assert deeds(list(alarm.serve(0, False, "ann"))) == [Deed.OUT_OF_SERVICE]
+    assert deeds(list(alarm.serve(0, False, "ann"))) == [AlarmAction.OUT_OF_SERVICE]
     assert list(alarm.serve(1, False, "ann")) == []
     assert [change.announced for change in alarm.see(10 * S, 300.0)] == [False]
     assert alarm.state is State.OUT_OF_SERVICE
     (back,) = alarm.serve(10**6 * S, True, "bob")
-    assert (back.deed, back.who, back.announced) == (Deed.IN_SERVICE, "bob", True)
+    assert (back.action, back.who, back.announced) == (AlarmAction.IN_SERVICE, "bob", True)
 
 
 def test_what_is_acknowledged_is_not_announced_again() -> None:
@@ -166,18 +168,18 @@ RULES = (
 def test_an_alarm_by_design_says_nothing_while_another_stands() -> None:
     board = Board(RULES)
     changes = board.see(S, {"silence": 1.0, "leakage": 300.0})
-    assert [(change.alarm, change.deed, change.announced) for change in changes] == [
-        ("stale", Deed.RAISED, True),
-        ("leak", Deed.RAISED, False),
-        ("leak", Deed.SUPPRESSED, False),
-        ("slow", Deed.SUPPRESSED, False),
+    assert [(change.alarm, change.action, change.announced) for change in changes] == [
+        ("stale", AlarmAction.RAISED, True),
+        ("leak", AlarmAction.RAISED, False),
+        ("leak", AlarmAction.SUPPRESSED, False),
+        ("slow", AlarmAction.SUPPRESSED, False),
     ]
     assert [alarm.rule.name for alarm in board.standing()] == ["stale"]
     changes = board.see(2 * S, {"silence": 0.0})
-    assert [(change.alarm, change.deed, change.announced) for change in changes] == [
-        ("stale", Deed.CLEARED, False),
-        ("leak", Deed.UNSUPPRESSED, True),
-        ("slow", Deed.UNSUPPRESSED, False),
+    assert [(change.alarm, change.action, change.announced) for change in changes] == [
+        ("stale", AlarmAction.CLEARED, False),
+        ("leak", AlarmAction.UNSUPPRESSED, True),
+        ("slow", AlarmAction.UNSUPPRESSED, False),
     ]
 
 
@@ -238,9 +240,9 @@ def test_delays_bound_how_often_an_alarm_comes(
     for pause, value in values:
         time += pause
         found += seen(alarm, (time, value))
-    assert [deed for _, deed in found[::2]] == [Deed.RAISED] * len(found[::2])
-    assert [deed for _, deed in found[1::2]] == [Deed.CLEARED] * len(found[1::2])
-    raised = [when for when, deed in found if deed is Deed.RAISED]
+    assert [deed for _, deed in found[::2]] == [AlarmAction.RAISED] * len(found[::2])
+    assert [deed for _, deed in found[1::2]] == [AlarmAction.CLEARED] * len(found[1::2])
+    raised = [when for when, deed in found if deed is AlarmAction.RAISED]
     gaps = [later - before for before, later in pairwise(raised)]
     assert all(gap >= on_s + off_s - 1e-6 for gap in gaps)
 
@@ -298,11 +300,13 @@ class AnyHistory(RuleBasedStateMachine):
     @invariant()
     def raised_and_cleared_take_turns(self) -> None:
         turns = [
-            change.deed
+            change.action
             for change in self.history
-            if change.alarm == "leak" and change.deed in (Deed.RAISED, Deed.CLEARED)
+            if change.alarm == "leak" and change.action in (AlarmAction.RAISED, AlarmAction.CLEARED)
         ]
-        assert turns == [(Deed.RAISED, Deed.CLEARED)[n % 2] for n in range(len(turns))]
+        assert turns == [
+            (AlarmAction.RAISED, AlarmAction.CLEARED)[n % 2] for n in range(len(turns))
+        ]
         assert self.alarm.active == (len(turns) % 2 == 1)
 
     @invariant()
@@ -315,18 +319,18 @@ class AnyHistory(RuleBasedStateMachine):
 
     @invariant()
     def nothing_quiet_is_announced(self) -> None:
-        quiet: set[Deed] = set()
+        quiet: set[AlarmAction] = set()
         ends = {
-            Deed.UNSHELVED: Deed.SHELVED,
-            Deed.UNSUPPRESSED: Deed.SUPPRESSED,
-            Deed.IN_SERVICE: Deed.OUT_OF_SERVICE,
+            AlarmAction.UNSHELVED: AlarmAction.SHELVED,
+            AlarmAction.UNSUPPRESSED: AlarmAction.SUPPRESSED,
+            AlarmAction.IN_SERVICE: AlarmAction.OUT_OF_SERVICE,
         }
         for change in self.history:
             if change.alarm != "leak":
                 continue
-            if change.deed in ends.values():
-                quiet.add(change.deed)
-            quiet.discard(ends.get(change.deed, Deed.RAISED))
+            if change.action in ends.values():
+                quiet.add(change.action)
+            quiet.discard(ends.get(change.action, AlarmAction.RAISED))
             assert not (change.announced and quiet)
 
     @invariant()
@@ -344,7 +348,7 @@ class AnyHistory(RuleBasedStateMachine):
             raised = [
                 n
                 for n, change in enumerate(self.history)
-                if change.alarm == "leak" and change.deed is Deed.RAISED
+                if change.alarm == "leak" and change.action is AlarmAction.RAISED
             ][-1]
             assert any(
                 change.announced and change.alarm == "leak" for change in self.history[raised:]
@@ -457,7 +461,7 @@ def test_a_warning_that_could_not_be_judged_keeps_its_alarm() -> None:
     found = [
         deeds(board.see(n * S, values(value))) for n, value in enumerate((over, unknown, good))
     ]
-    assert found == [[Deed.RAISED], [], [Deed.CLEARED]]
+    assert found == [[AlarmAction.RAISED], [], [AlarmAction.CLEARED]]
 
 
 def test_a_file_without_alarms_is_none(tmp_path: Path) -> None:
@@ -530,7 +534,7 @@ def test_what_nobody_was_told_of_is_over_with_what_suppressed_it() -> None:
 def test_what_still_stands_is_announced_with_the_end_of_what_suppressed_it() -> None:
     board, _ = quiet_figure()
     changes = board.see(9 * S, {"fault": 0.0})
-    assert [change.deed for change in changes if change.announced] == [Deed.UNSUPPRESSED]
+    assert [change.action for change in changes if change.announced] == [AlarmAction.UNSUPPRESSED]
     assert board["leak"].state is State.UNACKNOWLEDGED
 
 
@@ -555,15 +559,17 @@ def test_a_rule_on_what_nobody_says_is_refused(tmp_path: Path) -> None:
 def test_an_alarm_goes_on_under_another_name() -> None:
     board, diary = Board(board_rules(None)), Diary()
     changes = board.see(S, deviating("leakage"))
-    changes = [change for change in changes if change.deed is not Deed.SUPPRESSED]
+    changes = [change for change in changes if change.action is not AlarmAction.SUPPRESSED]
     changes += board["deviation_leakage"].acknowledge(2 * S, "ann")
     changes += board.rename(3 * S, "deviation.leakage", "deviation.porous_leakage")
     assert board["deviation_leakage"].state is State.NORMAL
     assert board["deviation_porous_leakage"].state is State.ACKNOWLEDGED
-    assert deeds(changes) == [Deed.RAISED, Deed.ACKNOWLEDGED, Deed.RENAMED]
+    assert deeds(changes) == [AlarmAction.RAISED, AlarmAction.ACKNOWLEDGED, AlarmAction.RENAMED]
     assert not changes[-1].announced  # somebody takes care already
     assert board.see(4 * S, {}) == []
-    changes += [change for change in board.see(5 * S, deviating()) if change.deed is Deed.CLEARED]
+    changes += [
+        change for change in board.see(5 * S, deviating()) if change.action is AlarmAction.CLEARED
+    ]
     assert [len(diary.take(change)) for change in changes] == [1, 1, 1, 1]
     assert episodes(changes) == [Episode("deviation_porous_leakage", S, 5 * S, 2 * S, "ann")]
 
@@ -586,8 +592,8 @@ def test_an_alarm_resumes_where_another_run_ended() -> None:
     after.resume(before.keep())
     assert after.state is State.SHELVED
     assert seen(after, (10, 300.0), (11, 100.0)) == []
-    assert seen(after, (16, 100.0)) == [(16, Deed.CLEARED)]
-    assert deeds(list(after.see(62 * S))) == [Deed.UNSHELVED]
+    assert seen(after, (16, 100.0)) == [(16, AlarmAction.CLEARED)]
+    assert deeds(list(after.see(62 * S))) == [AlarmAction.UNSHELVED]
     assert after.state is State.NORMAL
 
 

@@ -16,7 +16,7 @@ from twin.alarms.database import open_store
 from twin.alarms.loop import Alarms
 from twin.alarms.rules import Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
-from twin.alarms.writer import Keeper
+from twin.alarms.writer import AlarmWriter
 from twin.assets.unit import Unit
 from twin.audit import records
 from twin.cli import alarms as cli_alarms
@@ -41,8 +41,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 def begun(path: Path) -> Alarms:
     """Alarms of the gripper, one of them raised, kept in a database."""
-    keeper = Keeper(lambda: open_store(path), UNIT, pytest.fail)
-    alarms = Alarms(board_rules(None), lambda: APART + 6 * S, keeper.begin(), keeper)
+    alarm_writer = AlarmWriter(lambda: open_store(path), UNIT, pytest.fail)
+    alarms = Alarms(board_rules(None), lambda: APART + 6 * S, alarm_writer.begin(), alarm_writer)
     alarms.follow(rows(5), [deviation(5)])
     return alarms
 
@@ -146,8 +146,8 @@ def test_without_a_run_the_next_one_does_it(
     said = run("acknowledge", LEAK)
     assert said == f"{LEAK}: asked; twin run will do it when it is there again\n"
     run("unshelve", "plc_stale")
-    keeper = Keeper(lambda: open_store("alarms.sqlite"), UNIT, pytest.fail)
-    alarms = Alarms(board_rules(None), lambda: APART + 9 * S, keeper.begin(), keeper)
+    alarm_writer = AlarmWriter(lambda: open_store("alarms.sqlite"), UNIT, pytest.fail)
+    alarms = Alarms(board_rules(None), lambda: APART + 9 * S, alarm_writer.begin(), alarm_writer)
     said_there = [event.data["deed"] for _ in range(500) for event in _later(alarms)]
     alarms.close()
     assert said_there == ["acknowledged"]

@@ -17,8 +17,8 @@ from twin.alarms.loop import Alarms, Before, News
 from twin.alarms.requests import Request
 from twin.alarms.rules import Rule, by_cause, default_rules
 from twin.alarms.settings import board_rules
-from twin.alarms.state import Deed, Kept, State
-from twin.alarms.writer import Keeper
+from twin.alarms.state import AlarmAction, Kept, State
+from twin.alarms.writer import AlarmWriter
 from twin.assets.unit import Unit
 from twin.cli.alarms import alarms_of
 from twin.config import Config
@@ -81,7 +81,7 @@ class Desk:
 
     def close(self) -> None: ...
 
-    def ask(self, alarm: str, deed: Deed, seconds: float = 0.0, at: float = 0.0) -> None:
+    def ask(self, alarm: str, deed: AlarmAction, seconds: float = 0.0, at: float = 0.0) -> None:
         asked = APART + round(at * S)
         self.wishes.append(Request(1, alarm, deed, "ann", asked, seconds))
 
@@ -292,7 +292,7 @@ def test_warnings_of_figures_wait_for_their_delay_and_keep_their_cycles() -> Non
 def test_while_the_plc_is_silent_one_alarm_speaks_and_time_goes_on() -> None:
     stream = Stream()
     stream.at(1)
-    stream.desk.ask(LEAK, Deed.SHELVED, 60.0, at=2)
+    stream.desk.ask(LEAK, AlarmAction.SHELVED, 60.0, at=2)
     assert stream.silent(2, event(2, Kind.PLC_STALE)) == ["plc_stale raised", f"{LEAK} shelved"]
     assert stream.silent(61) == []
     assert stream.silent(62) == [f"{LEAK} unshelved"]
@@ -302,24 +302,24 @@ def test_while_the_plc_is_silent_one_alarm_speaks_and_time_goes_on() -> None:
 def test_what_people_ask_is_done_or_refused() -> None:
     stream = Stream()
     stream.at(5, deviation(5))
-    stream.desk.ask(LEAK, Deed.ACKNOWLEDGED)
+    stream.desk.ask(LEAK, AlarmAction.ACKNOWLEDGED)
     assert stream.at(6) == [f"{LEAK} acknowledged"]
     assert stream.said[-1].text == f"{LEAK} acknowledged by ann"
-    stream.desk.ask(LEAK, Deed.SHELVED, 600.0, at=6)
+    stream.desk.ask(LEAK, AlarmAction.SHELVED, 600.0, at=6)
     assert stream.at(6) == [f"{LEAK} shelved"]
     assert stream.said[-1].text == f"{LEAK} shelved by ann for 10 min"
     assert stream.desk.news.answers == {1: ""}
-    stream.desk.ask(LEAK, Deed.OUT_OF_SERVICE)
+    stream.desk.ask(LEAK, AlarmAction.OUT_OF_SERVICE)
     assert stream.at(8) == [f"{LEAK} out_of_service"]
-    stream.desk.ask(LEAK, Deed.UNSHELVED)
+    stream.desk.ask(LEAK, AlarmAction.UNSHELVED)
     assert stream.at(9) == [f"{LEAK} unshelved"]
-    stream.desk.ask(LEAK, Deed.IN_SERVICE)
+    stream.desk.ask(LEAK, AlarmAction.IN_SERVICE)
     assert stream.at(9) == [f"{LEAK} in_service"]
     assert stream.state(LEAK) is State.ACKNOWLEDGED
     for alarm, deed, why in (
-        ("nobody", Deed.ACKNOWLEDGED, "no alarm is called nobody"),
-        (LEAK, Deed.SHELVED, f"{LEAK}: the time to shelve it for is over already"),
-        (LEAK, Deed.RAISED, "raised is nothing that can be asked"),
+        ("nobody", AlarmAction.ACKNOWLEDGED, "no alarm is called nobody"),
+        (LEAK, AlarmAction.SHELVED, f"{LEAK}: the time to shelve it for is over already"),
+        (LEAK, AlarmAction.RAISED, "raised is nothing that can be asked"),
     ):
         stream.desk.ask(alarm, deed, 5.0)
         assert stream.at(10) == []
@@ -344,7 +344,7 @@ def acknowledged() -> Before:
     stream = Stream()
     stream.at(5, deviation(5))
     stream.at(9, diagnosis(9, 5, "suction_loss"))
-    stream.desk.ask("deviation_suction_loss", Deed.ACKNOWLEDGED)
+    stream.desk.ask("deviation_suction_loss", AlarmAction.ACKNOWLEDGED)
     stream.at(10)
     return stream.desk.before
 
@@ -393,8 +393,8 @@ def test_states_of_alarms_that_there_are_no_more_are_left() -> None:
 # The database.
 
 
-def kept(where: str | Path) -> Keeper:
-    return Keeper(lambda: open_store(where), UNIT, pytest.fail)
+def kept(where: str | Path) -> AlarmWriter:
+    return AlarmWriter(lambda: open_store(where), UNIT, pytest.fail)
 
 
 def test_a_defect_does_not_end_what_is_kept(
@@ -410,13 +410,13 @@ def test_a_defect_does_not_end_what_is_kept(
         save(store, *what)
 
     monkeypatch.setattr(Store, "save", flaky)
-    keeper = Keeper(lambda: open_store(tmp_path / "a.sqlite"), UNIT, said.append)
-    keeper.begin()
-    keeper.take(News(answers={1: ""}))
+    alarm_writer = AlarmWriter(lambda: open_store(tmp_path / "a.sqlite"), UNIT, said.append)
+    alarm_writer.begin()
+    alarm_writer.take(News(answers={1: ""}))
     end = time.monotonic() + 20.0
     while len(said) < 2 and time.monotonic() < end:
         time.sleep(0.002)
-    keeper.close()
+    alarm_writer.close()
     assert said == ["alarms wait in memory: MemoryError: ", "alarms are stored again"]
 
 
@@ -425,8 +425,8 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> No
     """The simulated rig with a leak, twice; between the runs somebody acknowledges it."""
 
     def one_run(fault: str) -> Collect:
-        seen, keeper = Collect(), kept(url)
-        alarms = Alarms(board_rules(None), lambda: 0, keeper.begin(), keeper)
+        seen, alarm_writer = Collect(), kept(url)
+        alarms = Alarms(board_rules(None), lambda: 0, alarm_writer.begin(), alarm_writer)
         theta, config = rigs.theta("gripper"), rigs.config("gripper")
         monitor = Monitor(config.monitor, theta, KeyFigures(config.data))
         blocks = rigs.cut(rigs.recorded("gripper", 20.0, (fault,))[0], 30)
@@ -448,7 +448,7 @@ def test_the_loop_keeps_its_episodes_and_goes_on_after_a_restart(url: str) -> No
         assert before.states[name] == Kept(active=True, acknowledged=False)
         assert episode.evidence["sigma"] == deviation.data["sigma"]
         assert episode.evidence["last_cycle"] > episode.evidence["first_cycle"]
-        number = store.ask(UNIT, name, Deed.ACKNOWLEDGED, "ann")
+        number = store.ask(UNIT, name, AlarmAction.ACKNOWLEDGED, "ann")
         states = {**before.states, name: Kept(active=True)}
         store.save(UNIT, News(states, {}, {number: ""}))
     seen = one_run("leakage=2.0")
@@ -477,12 +477,12 @@ def test_a_database_that_is_away_is_said_once_and_waited_for(
             raise SourceError("server: connection refused")
         return open_store(tmp_path / "a.sqlite")
 
-    keeper = Keeper(flaky, UNIT, said.append)
-    assert keeper.begin() == Before()
-    keeper.take(News({LEAK: Kept(active=True)}))
+    alarm_writer = AlarmWriter(flaky, UNIT, said.append)
+    assert alarm_writer.begin() == Before()
+    alarm_writer.take(News({LEAK: Kept(active=True)}))
     while tries < 4:
-        keeper.take(News())
-    keeper.close()
+        alarm_writer.take(News())
+    alarm_writer.close()
     assert said == [
         "alarms begin anew, and wait in memory: server: connection refused",
         "alarms are stored again",
@@ -497,10 +497,10 @@ def test_what_cannot_be_stored_to_the_end_is_said() -> None:
         raise SourceError("gone")
 
     said: list[str] = []
-    keeper = Keeper(away, UNIT, said.append)
-    keeper.begin()
-    keeper.take(News({LEAK: Kept()}))
-    keeper.close()
+    alarm_writer = AlarmWriter(away, UNIT, said.append)
+    alarm_writer.begin()
+    alarm_writer.take(News({LEAK: Kept()}))
+    alarm_writer.close()
     assert said[1:] == ["0 episodes of alarms could not be stored"]
 
 

@@ -14,14 +14,14 @@ from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.experiments import beside_weather
 from twin.diagnosis.hypotheses import often, price
-from twin.diagnosis.linear_screening import columns, promises, signatures
+from twin.diagnosis.linear_screening import columns, linear_gains, signatures
 from twin.diagnosis.residual_covariance import covariance
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
-from twin.monitor.detector_window import as_wide_as_needed, expected_knees
+from twin.monitor.detector_window import expected_detector, select_window
 from twin.monitor.switching_detector import PhaseFinder
 from twin.settings import Document
 from twin.signals import MBAR, Phase, Samples
@@ -200,14 +200,14 @@ def test_an_effect_that_does_nothing_on_a_unit_is_no_hypothesis() -> None:
     assert "threshold_drift" in offered(evidence)
     theta = evidence.theta.copy()
     theta[c.AIR_SAVING] = c.OFF
-    unit = replace(evidence, theta=theta, calibrated=theta, _seen={})
+    unit = replace(evidence, theta=theta, calibrated=theta, _detected_switchings={})
     assert offered(unit) == offered(evidence) - {"threshold_drift"}
 
 
 def offered(evidence: Evidence) -> set[str]:
     weights = covariance(evidence).of(evidence.judged)
     moved = signatures(evidence, weights.cycles)
-    found = promises(evidence, weights, columns(evidence, weights, moved), each=1)
+    found = linear_gains(evidence, weights, columns(evidence, weights, moved), each=1)
     return {fit.hypothesis[0].effect for fit in found}
 
 
@@ -215,8 +215,8 @@ def test_where_no_air_is_saved_no_switching_is_looked_for() -> None:
     theta, samples = rigs.theta("gripper").copy(), rigs.recorded("gripper", 12.0)[0]
 
     def hold(theta: Theta) -> int:
-        knees = as_wide_as_needed(expected_knees(theta, 0.3 * MBAR), [samples])
-        finder = PhaseFinder(knees)
+        detector = select_window(expected_detector(theta, 0.3 * MBAR), [samples])
+        finder = PhaseFinder(detector)
         phase = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
         return int(np.count_nonzero(phase == Phase.HOLD))
 

@@ -119,7 +119,8 @@ def test_a_data_set_at_another_supply_is_as_after_a_drop_of_it() -> None:
         dropped = apply(coefficients(own), "supply_pressure_drop", {"drop": drop})
         thetas = dropped, coefficients(own.at_supply(5.0 - drop)), coefficients(own)
         as_dropped, lower, before = (
-            Twin(theta, rigs.knees("gripper")).advance(samples)[1]["expected"] for theta in thetas
+            Twin(theta, rigs.detector("gripper")).advance(samples)[1]["expected"]
+            for theta in thetas
         )
         assert np.nanmax(np.abs(as_dropped - lower)) < 0.01 * np.nanmax(np.abs(lower - before))
     assert own.at_supply(5.0) == own

@@ -23,7 +23,7 @@ from twin.events import Event, Kind
 from twin.exchange.aas import read_package
 from twin.exchange.fmu_file import read_fmu
 from twin.files import MEMORY_BUDGET
-from twin.fleet.runner import Told, ask
+from twin.fleet.runner import Outcome, ask
 from twin.log import recorder
 from twin.log.check import check
 from twin.log.columns import decode
@@ -135,7 +135,7 @@ def test_one_deep_log_does_not_end_a_fleet(tmp_path: Path) -> None:
         [deep, good],
         lambda log: Config.of_log(document_in(log.header), log.header.metadata, str(log.path)),
     )
-    assert isinstance(first, Told)
+    assert isinstance(first, Outcome)
     assert first.state == "failed"
     assert "not valid TOML" in first.error
-    assert not isinstance(second, Told)
+    assert not isinstance(second, Outcome)

@@ -19,7 +19,7 @@ from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.parameters import FREE, Space, directions, values, with_values
 from twin.calibration.report import as_json, calibration_word, in_words
 from twin.calibration.save import store
-from twin.calibration.stationarity import refuse_changing
+from twin.calibration.stationarity import check_stationary
 from twin.calibration.verdict import USABLE
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
@@ -210,7 +210,7 @@ def test_cycles_of_a_unit_at_an_effects_bound_are_compared_as_well() -> None:
     system = data.system.model_copy(update={"film_coefficient": 500.0})
     data = data.model_copy(update={"system": system})
     cycles = Cycles.as_live(rigs.recorded("gripper", 12.0)[0], data)
-    refuse_changing(cycles, coefficients(data), data.sensor.noise_mbar * MBAR, [{}, {}])
+    check_stationary(cycles, coefficients(data), data.sensor.noise_mbar * MBAR, [{}, {}])
 
 
 @pytest.mark.slow

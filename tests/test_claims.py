@@ -20,7 +20,7 @@ from twin.alarms.loop import AGREEING
 from twin.compare import compare, side
 from twin.figures import cycle_view as course
 from twin.figures import key_figures, retention, trend
-from twin.figures import writer as keeper
+from twin.figures import writer as figure_writer
 from twin.fleet import peers, report
 from twin.hil import LONGEST_GAP_S
 from twin.log import recorder
@@ -28,9 +28,7 @@ from twin.log.columns import encode
 from twin.log.schema import SAMPLES
 from twin.model import gas
 from twin.monitor import change_detection as change
-from twin.monitor import clock
-from twin.monitor import detector_window as knees
-from twin.monitor import prediction_cache as drawings
+from twin.monitor import clock, detector_window, prediction_cache
 from twin.monitor.cycles import LONGEST_PIECE
 from twin.monitor.isolation import LEARNED
 from twin.monitor.model_bank import SUSPECTS
@@ -113,7 +111,11 @@ CLAIMS = (
         "isolation",
         "(each phase within {:g} % or {:g} ms, each level within {:g} mbar)",
         (),
-        (100.0 * drawings.LONGER, drawings.LONGER_MS, drawings.LEVEL / MBAR),
+        (
+            100.0 * prediction_cache.LONGER,
+            prediction_cache.LONGER_MS,
+            prediction_cache.LEVEL / MBAR,
+        ),
     ),
     ("key-figures", "a hole in the readings of more than {:g} ms", (), (course.LONGEST_HOLE / MS,)),
     (
@@ -122,7 +124,7 @@ CLAIMS = (
         (),
         (key_figures.STEADY,),
     ),
-    ("key-figures", "up to {} cycles wait in memory", (), (keeper.MOST_WAITING,)),
+    ("key-figures", "up to {} cycles wait in memory", (), (figure_writer.MOST_WAITING,)),
     ("key-figures", "in up to {} bins of time", (), (trend.BINS,)),
     ("key-figures", "unless the slope is sure to {:g} %", (), (100.0 * trend.SURE,)),
     ("key-figures", "Beyond {} times the length of the record", ("three",), (trend.FARTHEST,)),
@@ -156,14 +158,14 @@ def grouped(value: float) -> str:
 
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_the_model_is_as_far_behind_as_the_readme_says(name: str) -> None:
-    shipped = rigs.knees(name)
+    shipped = rigs.detector(name)
     readme = " ".join((rigs.ROOT / "README.md").read_text(encoding="utf-8").split())
     match = re.search(
         r"by up to (\d+) ms on the shipped systems, by up to ([\d.]+) s where", readme
     )
     assert match is not None
     assert shipped.lag <= float(match[1])
-    assert replace(shipped, window=knees.LONGEST_WINDOW).lag * MS <= float(match[2])
+    assert replace(shipped, window=detector_window.LONGEST_WINDOW).lag * MS <= float(match[2])
 
 
 def test_the_bank_looks_for_every_effect_in_small_steps() -> None:

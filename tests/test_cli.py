@@ -59,7 +59,7 @@ def make_log(path: Path, name: str, faults: tuple[str, ...]) -> Path:
     recorder = Recorder(path, LogHeader("type", "id", f"{name}.toml", document.text), clock=clock)
     blocks = rigs.cut(rigs.recorded(name, 25.0, faults)[0], 500)
     monitor = rigs.isolating(name)
-    monitor.teller = KeyFigures(rigs.config(name).data)  # as the program has it
+    monitor.key_figure_source = KeyFigures(rigs.config(name).data)  # as the program has it
     alarms = Alarms(board_rules(None), None)
     run(blocks, rigs.twin(name), monitor, [recorder], advisers=[alarms])
     return path

@@ -225,7 +225,7 @@ def test_h2_that_is_not_reached_has_no_time() -> None:
     assert not {"t0_measured", "t0_expected"} & figures(one_cycle(), THETA).keys()
 
 
-def test_the_levels_of_the_air_saving_are_its_knees() -> None:
+def test_the_levels_of_the_air_saving_are_its_breakpoints() -> None:
     samples, ticks = rows(
         (IDLE, 5), (SUCTION, 30), (HOLD, 30), (SUCTION, 30), (HOLD, 30), (IDLE, 9)
     )

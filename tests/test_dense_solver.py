@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from stepping import phase_rows
 from test_numerics import between_samples, cycle_of, moves_of
 
-from twin.model import dense_solver as strides
-from twin.model import kernel
+from twin.model import dense_solver, kernel
 from twin.model import theta as c
 from twin.model.dense_solver import DenseSolver
 from twin.model.theta import Theta
@@ -48,7 +47,7 @@ def read(
     expected, signals = np.empty(len(dt)), np.empty(len(dt), "u1")
     for rows in (slice(*ends) for ends in pairwise([0, *cuts, len(dt)])):
         out = expected[rows], signals[rows]
-        strides.advance(model, theta, dt[rows], phase[rows], level[rows], *out)
+        dense_solver.advance(model, theta, dt[rows], phase[rows], level[rows], *out)
     return expected, signals
 
 
@@ -110,7 +109,7 @@ def free(theta: Theta, commands: Signals, cuts: Sequence[int] = ()) -> tuple[Sig
     phase, expected, signals = (np.empty(len(commands), kind) for kind in ("u1", "f8", "u1"))
     for rows in (slice(*ends) for ends in pairwise([0, *cuts, len(commands)])):
         dt, out = np.full(len(commands[rows]), MS), (phase[rows], expected[rows], signals[rows])
-        strides.run_on(model, control, theta, dt, commands[rows], out)
+        dense_solver.run_on(model, control, theta, dt, commands[rows], out)
     return phase, expected
 
 

@@ -37,7 +37,7 @@ from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import PAPER_VACUUM
-from twin.monitor.switching_detector import Knees
+from twin.monitor.switching_detector import DetectorSettings
 from twin.quality import Quality
 from twin.settings import Document
 from twin.signals import MBAR, NS, Command, Phase, Samples
@@ -323,7 +323,7 @@ def test_what_grows_to_a_great_size_comes_first_with_its_course() -> None:
 @pytest.mark.parametrize(
     ("config", "plc", "lag"), [(CONFIG, PLC, 60.0), (GRIPPER, GRIPPER_PLC, 100.0)]
 )
-def test_a_sensor_too_slow_for_the_live_twin_to_see_every_knee_is_found_whole(
+def test_a_sensor_too_slow_for_the_live_twin_to_see_every_breakpoint_is_found_whole(
     config: Config, plc: PlcSettings, lag: float
 ) -> None:
     stream = blocks(plc, 27.0, [parse_fault(f"sensor_lag={lag}")], seed=23)
@@ -337,7 +337,9 @@ def test_a_sensor_too_slow_for_the_live_twin_to_see_every_knee_is_found_whole(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [41, 42])
-def test_where_the_nozzle_goes_off_several_times_each_knee_is_off_by_itself(seed: int) -> None:
+def test_where_the_nozzle_goes_off_several_times_each_breakpoint_is_off_by_itself(
+    seed: int,
+) -> None:
     """A gripper's leak has it go off twice a suction, which no healthy cycle shows."""
     stream = blocks(GRIPPER_PLC, 27.0, [parse_fault("porous_leakage=2.5")], seed)
     answer = of(stream, GRIPPER).json
@@ -398,14 +400,16 @@ def test_a_term_that_takes_nothing_away_in_mbar_is_no_extension(
     assert answer["extended"]["rms_mbar"] < answer["baseline"]["rms_mbar"]  # by its causes
 
 
-def test_a_knee_that_the_end_of_suction_follows_too_soon_judges_nobody() -> None:
+def test_a_breakpoint_that_the_end_of_suction_follows_too_soon_judges_nobody() -> None:
     """Nor does the blow-off after it: from where it begins is not known."""
-    knees = Knees(window=8, noise=31.0, off_shift=0, on_shift=11, settled=30, again=30, longest=60)
+    detector = DetectorSettings(
+        window=8, noise=31.0, off_shift=0, on_shift=11, settled=30, again=30, longest=60
+    )
 
     def left_out(*phases: tuple[Phase, int]) -> list[Phase]:
         phase = np.concatenate([np.full(rows, name, np.uint8) for name, rows in phases])
         ends = np.cumsum([rows for _, rows in phases])
-        names = zip(phases, np.split(_unsettled(phase, knees), ends[:-1]), strict=True)
+        names = zip(phases, np.split(_unsettled(phase, detector), ends[:-1]), strict=True)
         return [name for (name, _), rows in names if rows.all()]
 
     before, after = (
@@ -414,10 +418,10 @@ def test_a_knee_that_the_end_of_suction_follows_too_soon_judges_nobody() -> None
     )
     assert left_out(*before, *after) == []
     # The nozzle goes on 11 rows before that is seen.
-    for rows in (12, 11 + knees.settles - 1):
+    for rows in (12, 11 + detector.settles - 1):
         assert left_out(*before, (Phase.SUCTION, rows), *after) == [Phase.SUCTION, Phase.BLOW_OFF]
-    assert left_out(*before, (Phase.SUCTION, 11 + knees.settles), *after) == []
-    assert left_out((Phase.SUCTION, 200), (Phase.HOLD, knees.settles - 1), (Phase.IDLE, 90)) == [
+    assert left_out(*before, (Phase.SUCTION, 11 + detector.settles), *after) == []
+    assert left_out((Phase.SUCTION, 200), (Phase.HOLD, detector.settles - 1), (Phase.IDLE, 90)) == [
         Phase.HOLD,
         Phase.IDLE,
     ]

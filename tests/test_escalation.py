@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from test_alarms_loop import LEAK, UNIT, Stream, deviation, diagnosis, event
 
-from twin.alarms.state import Deed
+from twin.alarms.state import AlarmAction
 from twin.events import Kind
 from twin.notifications.call_store import open_calls
 from twin.notifications.email import EMAIL, MAIL
@@ -93,7 +93,7 @@ class Desk:
         self.stream.at(seconds, event(seconds, Kind.DEVIATION_CLEARED))
         return self.then()
 
-    def asked(self, deed: Deed, seconds: float = 0.0) -> list[str]:
+    def asked(self, deed: AlarmAction, seconds: float = 0.0) -> list[str]:
         self.stream.desk.ask(LEAK, deed, seconds, at=self.minute * 60 + 7)
         self.stream.at(self.minute * 60 + 7)
         return self.then()
@@ -116,8 +116,10 @@ def test_each_step_is_told_once_after_its_time(desk: Desk) -> None:
     assert desk.at(600) == []
 
 
-@pytest.mark.parametrize("deed", [Deed.ACKNOWLEDGED, Deed.SHELVED, Deed.OUT_OF_SERVICE])
-def test_what_a_person_does_ends_escalation(desk: Desk, deed: Deed) -> None:
+@pytest.mark.parametrize(
+    "deed", [AlarmAction.ACKNOWLEDGED, AlarmAction.SHELVED, AlarmAction.OUT_OF_SERVICE]
+)
+def test_what_a_person_does_ends_escalation(desk: Desk, deed: AlarmAction) -> None:
     desk.raised()
     desk.minute = 5
     assert desk.asked(deed, 3600.0) == []
@@ -133,7 +135,7 @@ def test_an_alarm_that_is_cleared_is_told_to_no_further_step(desk: Desk) -> None
 
 def test_an_alarm_whose_shelving_ends_is_told_anew(desk: Desk) -> None:
     desk.raised()
-    desk.asked(Deed.SHELVED, 1800.0)
+    desk.asked(AlarmAction.SHELVED, 1800.0)
     desk.at(20)
     desk.minute = 31
     desk.stream.at(31 * 60)
@@ -161,7 +163,7 @@ def test_what_is_not_stored_is_decided_again(desk: Desk) -> None:
 
 def test_an_alarm_that_ended_while_no_mail_was_configured_is_not_escalated(desk: Desk) -> None:
     desk.raised()
-    desk.stream.desk.ask(LEAK, Deed.ACKNOWLEDGED)
+    desk.stream.desk.ask(LEAK, AlarmAction.ACKNOWLEDGED)
     desk.stream.at(60)  # of which this escalation hears nothing
     standing = Stream(desk.stream.desk.before).alarms.standing()
     stated = [json.loads(restated(UNIT, alarm, 0).body) for alarm in standing]
@@ -239,7 +241,7 @@ def test_every_kind_of_database_keeps_who_was_told(url: str) -> None:
     desk.restart()
     assert desk.at(10) == ["bob escalated 1", "cem escalated 1"]
     desk.minute = 12
-    desk.asked(Deed.ACKNOWLEDGED)
+    desk.asked(AlarmAction.ACKNOWLEDGED)
     desk.restart()
     assert desk.at(40) == []
 

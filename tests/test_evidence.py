@@ -15,7 +15,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause
 from twin.model.dataset import coefficients
 from twin.monitor.cycles import whole
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import detector_of
 from twin.monitor.smoothed_nozzle import smoothed
 from twin.signals import Phase, Samples
 
@@ -48,16 +48,16 @@ def test_what_a_record_ties_together_moves_healthy_cycles_by_its_slope() -> None
     healthy = covariance(evidence)
     first = healthy.beyond[:, : len(tied)]
     assert np.abs(first[:, tied]).max() < 1e-3  # mbar
-    assert (healthy.left_open[:, ~tied] == 0.0).all()
+    assert (healthy.parameter_sensitivity[:, ~tied] == 0.0).all()
     bases = [evidence.theta]
     bases += [evidence.theta + 0.05 * (shift.up - evidence.theta) for shift in evidence.uncertain]
     off = evidence.off([HEALTHY] * len(bases), bases)
     slopes = (off[:, 1:] - off[:, :1]) / 0.05
     for way in np.flatnonzero(tied):
-        apart = np.linalg.norm(healthy.left_open[:, way] - slopes[:, way])
+        apart = np.linalg.norm(healthy.parameter_sensitivity[:, way] - slopes[:, way])
         assert apart < 0.1 * np.linalg.norm(slopes[:, way])
     about = covariance(evidence, (Cause("suction_loss", {"loss": 5.0}),))
-    assert (about.left_open == healthy.left_open).all()
+    assert (about.parameter_sensitivity == healthy.parameter_sensitivity).all()
     assert np.abs(about.beyond[:, : len(tied)][:, tied]).max() > 0.1
 
 
@@ -107,7 +107,7 @@ def test_rows_of_a_log_are_kept_compressed_and_come_back_to_the_bit(
     monkeypatch.setattr("twin.diagnosis.evidence.PIECE", piece)
     config = rigs.config("test_rig")
     log, theta = read_cycles(config, Reread()), coefficients(config.data)
-    settings = smoothed(theta, knees_of(config.data), Reread())
+    settings = smoothed(theta, detector_of(config.data), Reread())
     cycles = whole(Twin(theta, settings[0], config.data.terms, settings[1]).over(Reread()))
     assert log.cycles == len(cycles) > 15
     for number, cycle in enumerate(cycles):

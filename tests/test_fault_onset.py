@@ -32,7 +32,7 @@ FAULTS = {  # the drawn size lies in between
 def watched(name: str, fault: str, seconds: float, seed: int, size: int = 2000) -> Collect:
     """The loop over a rig with a fault, with its bank of hypotheses, key figures and alarms."""
     monitor, seen = rigs.isolating(name), Collect()
-    monitor.teller = KeyFigures(rigs.config(name).data)
+    monitor.key_figure_source = KeyFigures(rigs.config(name).data)
     blocks = rigs.cut(rigs.recorded(name, seconds, (fault,), seed)[0], size)
     run(blocks, rigs.twin(name), monitor, [seen], advisers=[Alarms(board_rules(None), None)])
     return seen

@@ -155,9 +155,9 @@ def test_neighbouring_grades_of_a_leak_are_told_apart() -> None:
 
 def test_a_slow_cadence_keeps_the_key_figures_that_no_switching_changes() -> None:
     told = []
-    teller = KeyFigures(rigs.config("gripper").data)
+    key_figure_source = KeyFigures(rigs.config("gripper").data)
     for piece in cut(rigs.twin("gripper").over([coarse(known("gripper"))])):
-        if (one := teller.take(piece)) is not None and one.complete:
+        if (one := key_figure_source.take(piece)) is not None and one.complete:
             told.append(one.measured)
     assert len(told) >= 8
     for measured in told[1:]:

@@ -403,9 +403,11 @@ def test_any_stream_gives_finite_figures_or_none(
 # Beside the loop.
 
 
-def events(name: str, teller: KeyFigures | None, rows: Samples | None = None) -> list[Event]:
+def events(
+    name: str, key_figure_source: KeyFigures | None, rows: Samples | None = None
+) -> list[Event]:
     collect = rigs.Collect()
-    monitor = Monitor(rigs.config(name).monitor, rigs.theta(name), teller)
+    monitor = Monitor(rigs.config(name).monitor, rigs.theta(name), key_figure_source)
     recorded = rigs.recorded(name, 20.0)[0] if rows is None else rows
     run(rigs.cut(recorded, 30), rigs.twin(name), monitor, [collect])
     return collect.of(Kind.CYCLE)

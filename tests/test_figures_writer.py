@@ -14,7 +14,7 @@ import pytest
 import rigs
 
 from twin.assets.unit import Unit
-from twin.cli.figures import keeper_of, key_figures_of
+from twin.cli.figures import figure_writer_of, key_figures_of
 from twin.config import Config
 from twin.errors import ConfigError, SourceError
 from twin.events import Event, Kind
@@ -23,7 +23,7 @@ from twin.figures.cycle import KeyFigures
 from twin.figures.database import Store, open_store
 from twin.figures.read import of_log
 from twin.figures.retention import LOOK_S, PORTION, Retention
-from twin.figures.writer import Alarms, Keeper
+from twin.figures.writer import Alarms, FigureWriter
 from twin.live import run
 from twin.log.header import LogHeader
 from twin.log.reader import open_log
@@ -49,10 +49,10 @@ def alarm(time_ns: int) -> Event:
 def keep(open_it: Callable[[], Store], *batches: list[Event]) -> list[str]:
     """Hand events to a keeper and close it; gives what it said."""
     said: list[str] = []
-    keeper = Keeper(open_it, UNIT, "a", said.append)
+    figure_writer = FigureWriter(open_it, UNIT, "a", said.append)
     for events in batches:
-        keeper.write(*NONE, events)
-    keeper.close()
+        figure_writer.write(*NONE, events)
+    figure_writer.close()
     return said
 
 
@@ -93,16 +93,16 @@ def test_a_database_that_is_away_is_said_once_and_waited_for(
             raise SourceError("server: figure database: connection refused")
         return open_store(tmp_path / "f.sqlite")
 
-    keeper = Keeper(flaky, UNIT, "a", said.append)
-    keeper.write(*NONE, [cycle(1)])
+    figure_writer = FigureWriter(flaky, UNIT, "a", said.append)
+    figure_writer.write(*NONE, [cycle(1)])
     for _ in range(3):
         assert tries.acquire(timeout=10)
-    keeper.write(*NONE, [cycle(2)])
+    figure_writer.write(*NONE, [cycle(2)])
     there.set()
     end = time.monotonic() + 10
     while len(said) < 2 and time.monotonic() < end:
         time.sleep(0.005)
-    keeper.close()
+    figure_writer.close()
     assert said[0] == "key figures wait in memory: server: figure database: connection refused"
     assert said[1].startswith("key figures are stored again: ")
     assert len(said) == 2
@@ -124,10 +124,10 @@ def test_a_defect_does_not_end_what_is_stored(
         return open_store(tmp_path / "f.sqlite")
 
     said: list[str] = []
-    keeper = Keeper(flaky, UNIT, "a", said.append)
-    keeper.write(*NONE, [cycle(1)])
+    figure_writer = FigureWriter(flaky, UNIT, "a", said.append)
+    figure_writer.write(*NONE, [cycle(1)])
     assert again.wait(20.0)
-    keeper.close()
+    figure_writer.close()
     assert said == [
         "key figures wait in memory: MemoryError: ",
         "key figures are stored again: 1 cycles had waited",
@@ -146,11 +146,11 @@ def test_what_is_stored_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
 
         def close(self) -> None: ...
 
-    keeper = Keeper(Counting, UNIT, "a", print)  # type: ignore[arg-type]
+    figure_writer = FigureWriter(Counting, UNIT, "a", print)  # type: ignore[arg-type]
     for number in (1, 2):
-        keeper.write(*NONE, [cycle(number)])
+        figure_writer.write(*NONE, [cycle(number)])
         assert batches.get(timeout=10) == [number]
-    keeper.close()
+    figure_writer.close()
     assert batches.empty()
 
 
@@ -182,12 +182,12 @@ def configured(folder: Path, table: str) -> Config:
 
 def test_a_configuration_says_whether_and_where_figures_are_kept(tmp_path: Path) -> None:
     said: list[str] = []
-    assert keeper_of(configured(tmp_path, ""), said.append) is None
-    opened = keeper_of(configured(tmp_path, "[figures]\nkeep = true\n"), said.append)
+    assert figure_writer_of(configured(tmp_path, ""), said.append) is None
+    opened = figure_writer_of(configured(tmp_path, "[figures]\nkeep = true\n"), said.append)
     assert opened is not None
-    keeper = opened()
-    keeper.write(*NONE, [cycle(1)])
-    keeper.close()
+    figure_writer = opened()
+    figure_writer.write(*NONE, [cycle(1)])
+    figure_writer.close()
     assert said == []
     with open_store(tmp_path / "figures.sqlite") as store:
         assert store.history(UNIT).cycle.tolist() == [1]
@@ -206,18 +206,18 @@ def old_and_new(path: Path) -> None:
 def run_once(folder: Path, table: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Store cycles as configured, until the keeper has looked for old ones; what it said."""
     said: list[str] = []
-    opened = keeper_of(configured(folder, table), said.append)
+    opened = figure_writer_of(configured(folder, table), said.append)
     assert opened is not None
     monkeypatch.setattr(module, "BATCH_S", 0.01)
-    keeper = opened()
+    figure_writer = opened()
     with open_store(folder / "figures.sqlite") as store:
         for number in range(2):  # the second is stored after the first deletion
             data = {**cycle(number).data, "host_ns": time.time_ns()}
-            keeper.write(*NONE, [Event(0, Kind.CYCLE, "", data)])
+            figure_writer.write(*NONE, [Event(0, Kind.CYCLE, "", data)])
             end = time.monotonic() + 20
             while store.counters(UNIT).cycles < 3 + number and time.monotonic() < end:
                 time.sleep(0.005)
-    keeper.close()
+    figure_writer.close()
     return said
 
 
@@ -302,7 +302,7 @@ def test_cycles_are_stored_although_old_ones_cannot_be_deleted(
 def test_what_is_wrong_in_the_configuration_is_said_before_the_run(tmp_path: Path) -> None:
     wrong = configured(tmp_path, '[figures]\nkeep = true\nurl = "mysql://host/name"\n')
     with pytest.raises(ConfigError, match="figure databases of kind 'mysql'"):
-        keeper_of(wrong, print)
+        figure_writer_of(wrong, print)
     wrong = configured(tmp_path, "[figures]\npermitted_t1 = 5\n")
     with pytest.raises(ConfigError, match=r"cell\.toml:2: figures\.permitted_t1: unknown key"):
         key_figures_of(wrong)
@@ -313,8 +313,8 @@ def test_the_loop_and_its_log_give_the_same_rows(tmp_path: Path) -> None:
     config = rigs.config("gripper")
     header = LogHeader(*UNIT, "gripper.toml", config.document.text)
     said: list[str] = []
-    keeper = Keeper(lambda: open_store(tmp_path / "f.sqlite"), UNIT, "a", said.append)
-    sinks = [Recorder(tmp_path / "run.mcap", header), keeper]
+    figure_writer = FigureWriter(lambda: open_store(tmp_path / "f.sqlite"), UNIT, "a", said.append)
+    sinks = [Recorder(tmp_path / "run.mcap", header), figure_writer]
     monitor = Monitor(config.monitor, rigs.theta("gripper"), KeyFigures(config.data))
     recorded = rigs.cut(rigs.recorded("gripper", 20.0, ("leakage=2.0@8",))[0], 30)
     run(recorded, rigs.twin("gripper"), monitor, sinks)

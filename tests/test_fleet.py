@@ -235,7 +235,7 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(
     with cluster(2) as started:
         keep = going._store_outcome
 
-        def killing(future: "Future[Done]", *rest: Any) -> going.Told:
+        def killing(future: "Future[Done]", *rest: Any) -> going.Outcome:
             started.workers[0].kill()  # with what it is at, and what it has done
             return keep(future, *rest)
 

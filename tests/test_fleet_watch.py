@@ -37,7 +37,7 @@ def test_a_small_size_is_seen_as_it_is(name: str, effect: str, size: float) -> N
 
 @pytest.mark.parametrize("name", ["test_rig", "gripper"])
 def test_of_a_slow_sensor_most_is_seen(name: str) -> None:
-    """Its knees are rounder as well, which no row says; a third is lost."""
+    """Its breakpoints are rounder as well, which no row says; a third is lost."""
     healthy, faulty = effects(name), effects(name, "sensor_lag=1.0")
     shown = faulty["sensor_lag"]["size"] - healthy["sensor_lag"]["size"]
     assert 0.5 < shown < 1.2

@@ -32,7 +32,7 @@ from twin.cli.sinks import supervised
 from twin.errors import SourceError
 from twin.events import Event, Kind
 from twin.figures.database import open_store
-from twin.figures.writer import Keeper
+from twin.figures.writer import FigureWriter
 from twin.live import Twin, run
 from twin.log.disk_file import Output
 from twin.log.part import SUFFIX
@@ -168,7 +168,7 @@ def known() -> Twin:
 
 
 def twin_beside() -> Twin:
-    return Twin(known().theta, known().knees, known().terms)
+    return Twin(known().theta, known().detector, known().terms)
 
 
 class Run:
@@ -343,7 +343,9 @@ class Beside:
         header = rigs.config("test_rig").log_header()
         outputs: dict[str, Any] = {
             "console": Console("", self.lines.append),
-            "key figures": Keeper(lambda: open_store(folder / "f.sqlite"), UNIT, "a", pytest.fail),
+            "key figures": FigureWriter(
+                lambda: open_store(folder / "f.sqlite"), UNIT, "a", pytest.fail
+            ),
             "live page": LiveRows(folder / "live.ring", 101_300.0, pytest.fail, Clock.ns),
             "log": Recorder(self.path, header, ROTATE_BYTES, Clock.s),
             "alarms": Alarms(board_rules(None), None),

@@ -200,7 +200,7 @@ def test_only_what_is_fit_to_be_judged_says_something() -> None:
     ]
     isolation = rigs.isolating("gripper").isolation
     assert isolation
-    heard = isolation.hear(looks)
+    heard = isolation.extract(looks)
     saying = {one.index: said for one, said in zip(cycles, heard, strict=True) if said}
     assert list(saying) == [cycle.index for cycle in cycles if cycle.complete and cycle.index != 2]
     for cycle in cycles:

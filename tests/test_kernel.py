@@ -74,7 +74,7 @@ def test_a_response_may_end_between_two_samples(delay: float) -> None:
 
 
 def test_hold_seen_in_the_pressure_needs_no_response() -> None:
-    """The knee is where the valve has acted already; a command is only where it will."""
+    """The breakpoint is where the valve has acted already; a command is only where it will."""
     theta = crisp()
     theta[c.RESPONSE_OFF], theta[c.RAMP_DOWN] = 50 * MS, 1 * MS
     seen = advance(theta, [(SUCTION, 500), (HOLD, 40)])
@@ -368,7 +368,7 @@ def test_the_twin_is_behind_only_in_suction() -> None:
     samples, _ = rigs.recorded("gripper", 6.0)
     row = int(np.flatnonzero(samples["commands"] == Command.SUCTION)[-1])
     given_out, _ = twin.advance(samples[:row])
-    assert 0 < row - len(given_out) <= twin.knees.lag < 100
+    assert 0 < row - len(given_out) <= twin.detector.lag < 100
     given_out = np.concatenate([given_out, twin.advance(samples[row : row + 2])[0]])
     assert len(given_out) == row + 2
 

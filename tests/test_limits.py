@@ -14,7 +14,7 @@ from twin.alarms.limit_changes import LimitChanges
 from twin.alarms.limits import ADJUSTABLE, UnitLimits, limits_in_force, with_unit
 from twin.alarms.loop import News
 from twin.alarms.requests import LimitChange
-from twin.alarms.writer import Keeper
+from twin.alarms.writer import AlarmWriter
 from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError
@@ -209,12 +209,12 @@ def test_a_change_outlives_the_run_until_it_is_reset(
     monkeypatch.setattr("twin.alarms.writer.POLL_S", 0.01)
 
     def one_run() -> Collect:
-        keeper = Keeper(lambda: open_store(url), UNIT, pytest.fail)
-        keeper.begin()
+        alarm_writer = AlarmWriter(lambda: open_store(url), UNIT, pytest.fail)
+        alarm_writer.begin()
         try:
-            return watched(LimitChanges(configured, keeper, time.time_ns))[0]
+            return watched(LimitChanges(configured, alarm_writer, time.time_ns))[0]
         finally:
-            keeper.close()
+            alarm_writer.close()
 
     with open_store(url) as store:
         store.change_limit(UNIT, "permitted_t1_ms", 10.0, "ann", "shorter cycle")

@@ -76,7 +76,7 @@ def test_the_rows_held_back_are_flushed_at_the_end() -> None:
     run([samples], rigs.twin("gripper"), rigs.monitor("gripper"), [seen])
     first, last = (len(part) for part in seen.samples)
     assert first + last == len(samples)
-    assert 0 < last <= rigs.knees("gripper").lag
+    assert 0 < last <= rigs.detector("gripper").lag
 
 
 def test_no_source_no_rows() -> None:

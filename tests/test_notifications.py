@@ -13,7 +13,7 @@ import pytest
 from test_alarms_cli import begun, run  # noqa: F401 - a fixture
 from test_alarms_loop import APART, LEAK, NONE, UNIT, S, Stream, deviation, diagnosis, event
 
-from twin.alarms.state import Deed
+from twin.alarms.state import AlarmAction
 from twin.assets.unit import Unit
 from twin.backoff import Backoff
 from twin.errors import SourceError
@@ -58,9 +58,9 @@ def test_a_change_is_told_with_the_whole_alarm() -> None:
 def test_every_change_has_an_id_of_its_own_and_an_episode_keeps_its() -> None:
     stream = Stream()
     stream.at(5, deviation(5))
-    stream.desk.ask(LEAK, Deed.ACKNOWLEDGED)
+    stream.desk.ask(LEAK, AlarmAction.ACKNOWLEDGED)
     stream.at(6)
-    stream.desk.ask(LEAK, Deed.SHELVED, 60.0, at=7)
+    stream.desk.ask(LEAK, AlarmAction.SHELVED, 60.0, at=7)
     stream.at(7)
     stream.at(9, event(9, Kind.DEVIATION_CLEARED))
     bodies = told(stream.said)
@@ -88,7 +88,7 @@ def test_a_suppression_that_keeps_nothing_quiet_is_not_told() -> None:
     """It would not be told either that it has ended."""
     stream = Stream()
     stream.at(5, deviation(5))
-    stream.desk.ask(LEAK, Deed.ACKNOWLEDGED)
+    stream.desk.ask(LEAK, AlarmAction.ACKNOWLEDGED)
     stream.at(6)
     stream.at(7, event(7, Kind.PLC_STALE))
     stream.at(8, event(8, Kind.DEVIATION_CLEARED))

@@ -48,9 +48,9 @@ def bodies(messages: Sequence[Message]) -> list[dict[str, Any]]:
 
 
 def test_every_cycle_is_told_with_its_asset_and_both_clocks() -> None:
-    teller = Cycles(ASSET, lambda: 77)
+    source = Cycles(ASSET, lambda: 77)
     events = [cycle(5, answer="long", leakage_measured=float("nan")), cycle(6, host_ns=10**18)]
-    first, second = bodies(teller.tell(NONE, NO_TICKS, [*events, Event(7, Kind.GAP, "")]))
+    first, second = bodies(source.tell(NONE, NO_TICKS, [*events, Event(7, Kind.GAP, "")]))
     assert first["format"] == "ejector-twin-cycle/1"
     assert first["asset"] == ASSET
     assert (first["cycle"], first["t0_measured"], first["leakage_measured"]) == (5, 189.0, None)
@@ -68,10 +68,10 @@ def test_a_row_has_what_its_period_had_however_blocks_are_cut(size: int, period_
     samples = samples.copy()
     samples["quality"][2500:2510], samples["pressure"][2500:2510] = Quality.BAD, 9e9
     samples, ticks = rigs.expectation(rigs.twin("gripper"), [samples])
-    teller, told = Values(ASSET, period_s, AMBIENT), list[Message]()
+    source, told = Values(ASSET, period_s, AMBIENT), list[Message]()
     for begin in range(0, len(samples), size):
-        told += teller.tell(samples[begin : begin + size], ticks[begin : begin + size], [])
-    told += teller.rest()
+        told += source.tell(samples[begin : begin + size], ticks[begin : begin + size], [])
+    told += source.rest()
     rows = [row for body in bodies(told) for row in body["rows"]]
     stretch = samples["time_ns"] // round(period_s * 1e9)
     assert len(rows) == len(np.unique(stretch))
@@ -100,12 +100,12 @@ def test_what_nothing_usable_is_known_of_is_null() -> None:
     samples, ticks = rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 7.0)[0]])
     samples, ticks = samples[:1500].copy(), ticks[:1500].copy()
     samples["quality"], ticks["expected"] = Quality.STALE, np.nan
-    teller = Values(ASSET, 600.0, AMBIENT)
-    assert teller.tell(samples, ticks, []) == []
-    ((row,),) = [body["rows"] for body in bodies(teller.rest())]
+    source = Values(ASSET, 600.0, AMBIENT)
+    assert source.tell(samples, ticks, []) == []
+    ((row,),) = [body["rows"] for body in bodies(source.rest())]
     assert row["measured_mbar"] == row["expected_mbar"] == {"low": None, "mean": None, "high": None}
     assert row["quality"] == Quality.STALE
-    assert teller.rest() == []
+    assert source.rest() == []
 
 
 # --- what waits ---------------------------------------------------------------------------------
@@ -211,8 +211,10 @@ def test_no_cycle_is_lost_while_the_broker_is_away(tmp_path: Path) -> None:
     def begun() -> Outlets:
         channel = Mqtt(settings, UNIT, Path(), pytest.fail, batch="2026-07")
         to = Sender("mqtt", channel, opened, settings, said.append, lanes=LANES)
-        tellers = [Cycles(ASSET), Values(ASSET, 1.0, AMBIENT)]
-        outlets = Outlets(UNIT, opened, [to], said.append, tellers={"mqtt": tellers})
+        message_sources = [Cycles(ASSET), Values(ASSET, 1.0, AMBIENT)]
+        outlets = Outlets(
+            UNIT, opened, [to], said.append, message_sources={"mqtt": message_sources}
+        )
         outlets.begin([])
         return outlets
 
@@ -237,7 +239,7 @@ def test_data_leaves_room_for_alarms_where_the_database_is_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dispatch, "MOST_IN_MEMORY", 10)
-    outlets = Outlets(UNIT, pytest.fail, [], pytest.fail, tellers={"mqtt": [Cycles(ASSET)]})  # type: ignore[arg-type]
+    outlets = Outlets(UNIT, pytest.fail, [], pytest.fail, message_sources={"mqtt": [Cycles(ASSET)]})  # type: ignore[arg-type]
     outlets.write(NONE, NO_TICKS, [cycle(n) for n in range(9)])
     assert outlets._queue.qsize() == 5
     assert outlets._lost == 4

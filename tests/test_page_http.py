@@ -416,7 +416,7 @@ def test_a_user_may_do_what_the_role_says(site: Site, role: Role, allowed: list[
         if deed not in allowed:
             assert "it needs the role" in answer.json()["error"]
     asked = [deed for deed in allowed if deed not in ("commented", "limit_changed")]
-    assert sorted(record.deed.value for record in _asked(site)) == sorted(asked)
+    assert sorted(record.action.value for record in _asked(site)) == sorted(asked)
 
 
 def test_a_user_with_a_name_of_any_letters_logs_in(site: Site) -> None:

@@ -43,14 +43,14 @@ class Stepped:
 class Never(PredictionCache):
     """Keeps none: all is stepped."""
 
-    def add(self, drawing: CachedPrediction) -> None:
+    def add(self, prediction: CachedPrediction) -> None:
         pass
 
 
 def stepping(name: str) -> ModelBank:
     """A bank that uses nothing again."""
     bank = ModelBank(rigs.theta(name))
-    bank._drawings = Never()
+    bank._cache = Never()
     return bank
 
 
@@ -204,7 +204,7 @@ def beside(name: str) -> tuple[ModelBank, ModelBank, Cycle]:
     for cycle in known:
         bank.take(cycle)
         other.take(cycle)
-    assert len(bank._drawings) == 1
+    assert len(bank._cache) == 1
     return bank, other, known[-1]
 
 
@@ -237,7 +237,7 @@ def test_what_went_differently_never_goes_alike_again(what: str) -> None:
     may = []
     for end in range(1, len(cycle.samples) + 1):
         _, stretches, _ = bank._look(cycle.samples[:end], cycle.ticks[:end])
-        may.append(stretches is not None and bank._drawings.may_be(stretches))
+        may.append(stretches is not None and bank._cache.could_hit(stretches))
     assert may == sorted(may, reverse=True)
     assert may[-1] == (what == "shorter idle")  # that is seen only at its end
 
@@ -309,14 +309,14 @@ def test_few_drawings_are_kept_and_the_last_ones_used() -> None:
     for number in range(2 * KEPT):
         other = later(longer(known, Phase.SUCTION, 30 * (number + 1)), before)
         bank.take(other)
-        assert len(bank._drawings) <= KEPT
+        assert len(bank._cache) <= KEPT
         before = later(known, other)
         bank.take(before)  # used each time
-    kept = [drawing.stretches.how[0, 0] for drawing in bank._drawings._kept]
+    kept = [prediction.stretches.how[0, 0] for prediction in bank._cache._kept]
     first = int(np.sum(known.ticks["phase"] == Phase.SUCTION)) - 1
     assert first in kept
     assert sorted(kept)[1:] == [first + 30 * (2 * KEPT - n) for n in reversed(range(KEPT - 1))]
-    assert all(len(drawing.drawn) <= LONGEST_PIECE for drawing in bank._drawings._kept)
+    assert all(len(prediction.drawn) <= LONGEST_PIECE for prediction in bank._cache._kept)
     assert bank._stepped == len(bank._expected) == 0
 
 
@@ -328,5 +328,5 @@ def test_nothing_is_kept_before_the_models_have_swung_in(broken: Quality) -> Non
     kept = []
     for cycle in cycles[: 4 + SWUNG_IN]:
         bank.take(cycle)
-        kept.append(len(bank._drawings))
+        kept.append(len(bank._cache))
     assert kept == [0] * (3 + SWUNG_IN) + [1]

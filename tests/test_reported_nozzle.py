@@ -46,7 +46,7 @@ def silent(samples: Samples) -> Samples:
 
 
 def phases(samples: Samples, size: int = 500) -> npt.NDArray[np.uint8]:
-    finder = PhaseFinder(rigs.knees("gripper"))
+    finder = PhaseFinder(rigs.detector("gripper"))
     parts = [finder.push(block)[1] for block in rigs.cut(samples, size)]
     return np.concatenate([*parts, finder.flush()[1]])
 
@@ -87,10 +87,10 @@ def test_it_is_the_same_however_the_stream_is_cut(size: int) -> None:
 
 
 def test_a_report_just_before_suction_ends_counts() -> None:
-    """Its knee has no rows after it; the valve acts a response later, if suction lasts so long."""
+    """Its breakpoint has no rows after it; the valve acts a response later, if suction lasts."""
     samples, moved = simulated("gripper", 0.0, small=False)
     samples, end = samples.copy(), int(moved[0]) - 100
-    closing, _ = rigs.knees("gripper").acts
+    closing, _ = rigs.detector("gripper").acts
     samples["commands"][end : moved[0] + 400] = 0
     for reported, acts in ((end - closing - 8, True), (end - closing + 2, False)):
         samples["reported"][reported:end] &= ~np.uint8(Reported.NOZZLE)

@@ -35,7 +35,7 @@ from drivers.outputs.state import Results
 from twin.alarms import writer as keeper_module
 from twin.alarms.loop import Alarms
 from twin.alarms.settings import board_rules
-from twin.alarms.state import Deed
+from twin.alarms.state import AlarmAction
 from twin.audit import records
 from twin.cli.alarms import asker_of
 from twin.config import Config
@@ -118,7 +118,7 @@ def test_an_alarm_comes_with_what_is_compared(server: ResultsServer, tmp_path: P
         stream.at(5, deviation(5))
         told(sink, stream)
         (raised,) = watcher.until(counted(1))
-        stream.desk.ask(LEAK, Deed.ACKNOWLEDGED)
+        stream.desk.ask(LEAK, AlarmAction.ACKNOWLEDGED)
         stream.at(6)
         stream.at(9, event(9, Kind.DEVIATION_CLEARED))
         told(sink, stream)
@@ -189,7 +189,7 @@ def test_who_comes_later_is_told_what_stands(server: ResultsServer, tmp_path: Pa
     before.at(5, deviation(5))
     before.at(6, event(6, Kind.PLC_STALE))
     before.at(7, event(7, Kind.PLC_BACK))
-    before.desk.ask("plc_stale", Deed.ACKNOWLEDGED)
+    before.desk.ask("plc_stale", AlarmAction.ACKNOWLEDGED)
     before.at(8)
     sink = server.sink("later", "")
     sink.resume(Stream(before.desk.before).alarms.standing(), 10**18)
@@ -217,8 +217,8 @@ class Beside:
         text = f'[data]\n[asset]\ntype = "{UNIT.type}"\nid = "{UNIT.id}"\n[alarms]\nkeep = true\n'
         (folder / "cell.toml").write_text(text, encoding="utf-8")
         self.config = Config.of(Document.read(folder / "cell.toml"))
-        keeper = kept(folder / "alarms.sqlite")
-        self.alarms = Alarms(board_rules(None), lambda: 0, keeper.begin(), keeper)
+        alarm_writer = kept(folder / "alarms.sqlite")
+        self.alarms = Alarms(board_rules(None), lambda: 0, alarm_writer.begin(), alarm_writer)
         self.sink = server.sink(name, UNIT.type, asker_of(self.config))
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._loop)

@@ -63,10 +63,10 @@ def cycles(name: str, samples: Samples) -> Sequence[Cycle]:
 
 def told(name: str, samples: Samples) -> dict[str, str]:
     """What each signal that contradicts says."""
-    knees, theta = rigs.knees(name), rigs.theta(name)
+    detector, theta = rigs.detector(name), rigs.theta(name)
     return {
         contradiction.signal: contradiction.what
-        for contradiction in standing(cycles(name, samples), theta, knees)
+        for contradiction in standing(cycles(name, samples), theta, detector)
     }
 
 
@@ -74,7 +74,7 @@ def told(name: str, samples: Samples) -> dict[str, str]:
 @pytest.mark.parametrize("late_ms", [0.0, 20.0])
 def test_what_is_right_agrees_in_every_cycle(name: str, tags: set[str], late_ms: float) -> None:
     for cycle in cycles(name, simulated(name, late_ms)):
-        assert check(cycle, rigs.theta(name), rigs.knees(name)) == dict.fromkeys(tags)
+        assert check(cycle, rigs.theta(name), rigs.detector(name)) == dict.fromkeys(tags)
 
 
 @pytest.mark.parametrize("name", ["test_rig", "gripper"])
@@ -97,7 +97,7 @@ def test_where_nothing_is_reported_nothing_is_checked() -> None:
     samples = rigs.recorded("gripper", 20.0)[0].copy()
     samples["supply"] = np.nan
     cycle = cycles("gripper", samples)[1]
-    assert check(cycle, rigs.theta("gripper"), rigs.knees("gripper")) == {}
+    assert check(cycle, rigs.theta("gripper"), rigs.detector("gripper")) == {}
 
 
 def never_saves(samples: Samples) -> None:
@@ -186,7 +186,7 @@ def test_one_cycle_alone_raises_nothing_and_agreement_is_told_too() -> None:
     samples = simulated("gripper").copy()
     parts = list(whole(rigs.twin("gripper").over([samples])))
     wrong = [replace(piece, samples=changed(piece.samples, barometer)) for piece in parts]
-    watch = ReportWatch(rigs.theta("gripper"), rigs.knees("gripper"))
+    watch = ReportWatch(rigs.theta("gripper"), rigs.detector("gripper"))
     stream = [parts[0], wrong[1], parts[2], wrong[3], wrong[4], wrong[5], *parts[6:9]]
     events = [[event.kind for event in watch.take(cycle)] for cycle in stream]
     against, agrees = Kind.SIGNAL_CONTRADICTS, Kind.SIGNAL_AGREES
@@ -196,7 +196,7 @@ def test_one_cycle_alone_raises_nothing_and_agreement_is_told_too() -> None:
 def test_the_loop_says_it_and_an_alarm_stands_until_all_agree() -> None:
     samples = changed(simulated("gripper"), barometer)
     monitor, beside = rigs.monitor("gripper"), rigs.twin("gripper")
-    monitor.reports = ReportWatch(beside.theta, beside.knees)
+    monitor.reports = ReportWatch(beside.theta, beside.detector)
     seen = rigs.Collect()
     run(rigs.cut(samples, 500), beside, monitor, [seen])
     (event,) = seen.of(Kind.SIGNAL_CONTRADICTS)

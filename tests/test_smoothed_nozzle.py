@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_reported_nozzle import NEAR, off_by, silent, simulated, switched
 
 from twin.model.dataset import coefficients
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import detector_of
 from twin.monitor.offline_switching import noise_of
 from twin.monitor.smoothed_nozzle import _pieces, _Search, smoothed
 from twin.monitor.switching_detector import PhaseFinder, commanded
@@ -21,13 +21,13 @@ KNOWN, ON = int(Reported.NOZZLE_KNOWN), int(Reported.NOZZLE_KNOWN | Reported.NOZ
 
 
 def nozzle(samples: Samples, name: str = "gripper") -> Bytes:
-    told = smoothed(rigs.theta(name), rigs.knees(name), [samples])[1]
+    told = smoothed(rigs.theta(name), rigs.detector(name), [samples])[1]
     assert told is not None
     return told
 
 
 def phases(samples: Samples, size: int = 5000, name: str = "gripper") -> Bytes:
-    finder = PhaseFinder(*smoothed(rigs.theta(name), rigs.knees(name), [samples]))
+    finder = PhaseFinder(*smoothed(rigs.theta(name), rigs.detector(name), [samples]))
     parts = [finder.push(block)[1] for block in rigs.cut(samples, size)]
     return np.concatenate([*parts, finder.flush()[1]])
 
@@ -59,7 +59,7 @@ def test_pieces_of_a_long_log_show_the_same(monkeypatch: pytest.MonkeyPatch) -> 
     samples = silent(simulated("gripper", 0.0, small=False)[0])
     whole = nozzle(samples)
     monkeypatch.setattr("twin.monitor.smoothed_nozzle.PIECE", 4000)
-    finder_settings = rigs.theta("gripper"), rigs.knees("gripper")
+    finder_settings = rigs.theta("gripper"), rigs.detector("gripper")
     in_pieces = smoothed(*finder_settings, list(rigs.cut(samples, 700)))[1]
     assert in_pieces is not None
     assert np.count_nonzero(in_pieces != whole) < 20  # a few rows earlier or later
@@ -84,7 +84,7 @@ def test_nothing_is_known_of_an_ejector_that_saves_no_air() -> None:
     data = rigs.config("gripper").data
     off = data.model_copy(update={"ejector": data.ejector.model_copy(update={"air_saving": "off"})})
     samples, _ = simulated("gripper", 0.0, small=False)
-    assert smoothed(coefficients(off), knees_of(off), [samples])[1] is None
+    assert smoothed(coefficients(off), detector_of(off), [samples])[1] is None
 
 
 def test_a_switching_too_near_the_end_to_show_is_decided_by_level() -> None:
@@ -98,24 +98,24 @@ def test_a_switching_too_near_the_end_to_show_is_decided_by_level() -> None:
 
 def test_a_nozzle_that_goes_on_just_before_suction_ends_is_seen() -> None:
     samples = silent(rigs.recorded("gripper", 20.0, faults=("leakage=4.0",))[0])
-    finder = PhaseFinder(rigs.knees("gripper"))
+    finder = PhaseFinder(rigs.detector("gripper"))
     live = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
-    knees = switched(live)
-    on = int(knees[live[knees] == Phase.SUCTION][3])
+    detector = switched(live)
+    on = int(detector[live[detector] == Phase.SUCTION][3])
     samples["commands"][on + 30 : on + 300] = 0
     assert np.abs(switched(phases(samples)) - on).min() <= 3
 
 
 def test_an_ejector_that_reports_its_nozzle_needs_no_search() -> None:
     samples, _ = simulated("gripper", 20.0, small=True)
-    knees = rigs.knees("gripper")
-    assert smoothed(rigs.theta("gripper"), knees, [samples]) == (knees, None)
+    detector = rigs.detector("gripper")
+    assert smoothed(rigs.theta("gripper"), detector, [samples]) == (detector, None)
 
 
 def test_what_is_told_decides() -> None:
     samples = silent(simulated("gripper", 0.0, small=False)[0])
     never = np.full(len(samples), ON, np.uint8)
-    finder = PhaseFinder(rigs.knees("gripper"), never)
+    finder = PhaseFinder(rigs.detector("gripper"), never)
     assert not (np.concatenate([finder.push(samples)[1], finder.flush()[1]]) == Phase.HOLD).any()
 
 
@@ -174,7 +174,7 @@ def test_any_log_keeps_its_rows(seed: int) -> None:
     blocks = rigs.cut(samples, 1 + count // 9)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.monitor.smoothed_nozzle.PIECE", 2000)
-        finder = PhaseFinder(*smoothed(rigs.theta("gripper"), rigs.knees("gripper"), blocks))
+        finder = PhaseFinder(*smoothed(rigs.theta("gripper"), rigs.detector("gripper"), blocks))
     assert finder.nozzle is not None
     assert len(finder.nozzle) == count
     assert len(finder.push(samples)[0]) + len(finder.flush()[0]) == count

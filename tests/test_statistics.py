@@ -12,15 +12,15 @@ from twin.monitor.model_bank import SUSPECTS, ModelBank
 from twin.monitor.statistics import PLACES, WEAK, CycleResidual, ScoreExtractor
 
 Floats = npt.NDArray[np.float64]
-Heard = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
+CycleInput = tuple[Cycle, npt.NDArray[np.int64], Floats, dict[str, float]]
 
 
-def listener() -> ScoreExtractor:
+def extractor() -> ScoreExtractor:
     return ScoreExtractor.of(rigs.config("gripper").data, rigs.config("gripper").monitor.healthy)
 
 
 @pytest.fixture(scope="module")
-def heard() -> list[Heard]:
+def heard() -> list[CycleInput]:
     """Cycles that have swung in, with what a bank and the monitor say of them."""
     rows = rigs.expectation(rigs.twin("gripper"), [rigs.recorded("gripper", 20.0)[0]])
     theta = rigs.theta("gripper")
@@ -29,7 +29,7 @@ def heard() -> list[Heard]:
     return [heard for heard in found if heard[0].complete and heard[0].settled]
 
 
-def without(heard: Heard, rows: slice) -> Heard:
+def without(heard: CycleInput, rows: slice) -> CycleInput:
     """The same cycle with no deviation in some rows."""
     cycle, drawn, expected, found = heard
     ticks = cycle.ticks.copy()
@@ -37,8 +37,8 @@ def without(heard: Heard, rows: slice) -> Heard:
     return Cycle(0, cycle.samples, ticks, complete=True), drawn, expected, found
 
 
-def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[Heard]) -> None:
-    said = listener().hear(*heard[0])
+def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[CycleInput]) -> None:
+    said = extractor().extract(*heard[0])
     assert said
     inverse = np.linalg.inv(said.alone)
     power = np.diag(said.signatures.T @ inverse @ said.signatures)
@@ -57,41 +57,41 @@ def assert_same(residual: CycleResidual | None, other: CycleResidual | None) -> 
         np.testing.assert_array_equal(getattr(residual, name), getattr(other, name), err_msg=name)
 
 
-def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[Heard]) -> None:
+def test_of_what_a_cycle_does_not_depend_on_it_says_nothing(heard: list[CycleInput]) -> None:
     """Else its scores are what steps make of nothing, and false alarms are three times as many."""
     names = [suspect.parameter.name for suspect in SUSPECTS]
     for cycle in heard:
         assert "h1_low_level" not in cycle[3]  # the nozzle stays off
-        said = listener().hear(*cycle)
+        said = extractor().extract(*cycle)
         assert said
         shown = np.isfinite(said.scores())
         assert [names[i] for i in np.flatnonzero(~shown)] == ["h2_shift"]
 
 
 @pytest.mark.slow
-def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[Heard]) -> None:
-    old = listener()
+def test_a_cycle_says_the_same_whichever_were_heard_before(heard: list[CycleInput]) -> None:
+    old = extractor()
     for cycle in heard * 2:
         for other in (cycle, without(cycle, slice(300, 350)), without(cycle, slice(0, 3))):
-            assert_same(old.hear(*other), listener().hear(*other))
+            assert_same(old.extract(*other), extractor().extract(*other))
 
 
-def test_where_bins_are_is_remembered_of_few_cycles(heard: list[Heard]) -> None:
-    old = listener()
+def test_where_bins_are_is_remembered_of_few_cycles(heard: list[CycleInput]) -> None:
+    old = extractor()
     for gap in range(2 * PLACES):
-        old.hear(*without(heard[0], slice(0, 10 * gap)))
+        old.extract(*without(heard[0], slice(0, 10 * gap)))
         assert 1 <= len(old._seen) <= PLACES
 
 
-def test_what_no_hypothesis_knows_is_not_heard(heard: list[Heard]) -> None:
+def test_what_no_hypothesis_knows_is_not_heard(heard: list[CycleInput]) -> None:
     cycle, drawn, expected, found = heard[0]
-    all_there = listener().hear(cycle, drawn, expected, found)
+    all_there = extractor().extract(cycle, drawn, expected, found)
     expected = expected.copy()
     expected[:, 3] = np.nan
-    assert listener().hear(cycle, drawn, expected, found) is None
+    assert extractor().extract(cycle, drawn, expected, found) is None
     expected[:, 3] = expected[:, 4]
     expected[drawn < 400, 3] = np.nan  # one hypothesis, for a while
-    said = listener().hear(cycle, drawn, expected, found)
+    said = extractor().extract(cycle, drawn, expected, found)
     assert all_there
     assert said
     assert 0 < len(said.place) < len(all_there.place)

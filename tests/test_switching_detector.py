@@ -15,8 +15,18 @@ from drivers.plc.simulate import blocks, with_truth
 from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
-from twin.monitor.detector_window import LONGEST_WINDOW, as_wide_as_needed, expected_knees, knees_of
-from twin.monitor.switching_detector import IDLE_ROWS, SHORTEST_WINDOW, Knees, PhaseFinder
+from twin.monitor.detector_window import (
+    LONGEST_WINDOW,
+    detector_of,
+    expected_detector,
+    select_window,
+)
+from twin.monitor.switching_detector import (
+    IDLE_ROWS,
+    SHORTEST_WINDOW,
+    DetectorSettings,
+    PhaseFinder,
+)
 from twin.quality import BREAK, Quality
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, sampling_ms
 
@@ -34,8 +44,8 @@ CONDITIONS = {
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
 
 
-def find(samples: Samples, knees: Knees, block: int = 1000) -> Found:
-    finder = PhaseFinder(knees)
+def find(samples: Samples, detector: DetectorSettings, block: int = 1000) -> Found:
+    finder = PhaseFinder(detector)
     parts = [finder.push(part) for part in rigs.cut(samples, block)]
     parts.append(finder.flush())
     rows, phase, level = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -62,20 +72,22 @@ def compare(
     samples, truth = rigs.recorded(name, SECONDS, faults, seed, air_saving)
     if bad:
         samples = rigs.spoilt(samples, bad, seed)
-    return found_where_true(samples, truth, rigs.knees(name))
+    return found_where_true(samples, truth, rigs.detector(name))
 
 
-def found_where_true(samples: Samples, truth: npt.NDArray[np.void], knees: Knees) -> list[int]:
+def found_where_true(
+    samples: Samples, truth: npt.NDArray[np.void], detector: DetectorSettings
+) -> list[int]:
     """Rows by which each switch is found late; an assertion fails where one is not or is no one.
 
     A switch just before the end of suction cannot be told from it; one just after its beginning
     is the valve's answer to the command.
     """
-    _, phase, _ = find(samples, knees)
+    _, phase, _ = find(samples, detector)
     suction = samples["commands"] == Command.SUCTION
     to_end = since_edge(suction[::-1])[::-1]
     true = switches(truth["nozzle"] == 1, suction)
-    true = {(row, on) for row, on in true if since_edge(suction)[row] > knees.settled}
+    true = {(row, on) for row, on in true if since_edge(suction)[row] > detector.settled}
     late = []
     found = switches(phase == Phase.SUCTION, suction)
     for row, on in sorted(true):
@@ -84,7 +96,7 @@ def found_where_true(samples: Samples, truth: npt.NDArray[np.void], knees: Knees
             for switching in found
             if switching[1] == on and abs(switching[0] - row) <= NEAR
         ]
-        if not near and to_end[row] <= knees.lag + NEAR:
+        if not near and to_end[row] <= detector.lag + NEAR:
             continue
         assert len(near) == 1, f"the nozzle switched to {on} at row {row}, found: {sorted(found)}"
         found -= set(near)
@@ -117,14 +129,14 @@ def test_a_gripper_that_leaks_switches_on_again() -> None:
     samples, truth = rigs.recorded("gripper", SECONDS, ("leakage=2",), 1)
     suction = samples["commands"] == Command.SUCTION
     again = {row for row, on in switches(truth["nozzle"] == 1, suction) if on}
-    again = {row for row in again if since_edge(suction)[row] > rigs.knees("gripper").settled}
+    again = {row for row in again if since_edge(suction)[row] > rigs.detector("gripper").settled}
     assert len(again) >= 9  # so that the comparison above sees both directions
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
-def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
+def test_the_level_at_a_breakpoint_is_that_of_the_control(name: str) -> None:
     samples, _ = rigs.recorded(name, SECONDS)
-    _, phase, level = find(samples, rigs.knees(name))
+    _, phase, level = find(samples, rigs.detector(name))
     vacuum = (
         rigs.theta(name)[c.AMBIENT] - level[(phase == Phase.HOLD) & np.isfinite(level)]
     ) / MBAR
@@ -136,7 +148,9 @@ def test_the_level_at_a_knee_is_that_of_the_control(name: str) -> None:
 # What commands say.
 
 
-KNEES = Knees(window=10, noise=30.0, off_shift=0, on_shift=4, settled=30, again=30, longest=60)
+SETTINGS = DetectorSettings(
+    window=10, noise=30.0, off_shift=0, on_shift=4, settled=30, again=30, longest=60
+)
 
 
 def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Samples:
@@ -151,7 +165,7 @@ def stream(commands: npt.ArrayLike, pressure: float | npt.ArrayLike = 1e5) -> Sa
 @settings(deadline=None)  # the first call compiles
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=200), st.integers(1, 50))
 def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], block: int) -> None:
-    rows, phase, _ = find(stream(commands), KNEES, block)
+    rows, phase, _ = find(stream(commands), SETTINGS, block)
     wanted = [
         Phase.BLOW_OFF if value & 2 else Phase.SUCTION if value & 1 else Phase.IDLE
         for value in commands
@@ -163,28 +177,28 @@ def test_at_constant_pressure_the_commands_are_the_phases(commands: list[int], b
 @given(st.integers(1, 40), st.integers(1, 100))
 @settings(deadline=None)
 def test_a_timed_pulse_is_as_long_as_the_ejector_makes_it(command_rows: int, block: int) -> None:
-    knees = replace(KNEES, blow_off=(float(c.TIMED), 0.1))
+    detector = replace(SETTINGS, blow_off=(float(c.TIMED), 0.1))
     commands = [1] * 50 + [2] * command_rows + [0] * (200 - command_rows)
-    _, phase, _ = find(stream(commands), knees, block)
+    _, phase, _ = find(stream(commands), detector, block)
     assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
 
 
 def test_an_internal_pulse_follows_suction_by_itself() -> None:
-    knees = replace(KNEES, blow_off=(float(c.INTERNAL), 0.1))
-    _, phase, _ = find(stream([1] * 50 + [0] * 200), knees, 30)
+    detector = replace(SETTINGS, blow_off=(float(c.INTERNAL), 0.1))
+    _, phase, _ = find(stream([1] * 50 + [0] * 200), detector, 30)
     assert phase.tolist() == [1] * 50 + [3] * 100 + [0] * 100
 
 
 def test_blow_off_wins() -> None:
-    _, phase, _ = find(stream([1] * 50 + [3] * 50 + [1] * 50), KNEES)
+    _, phase, _ = find(stream([1] * 50 + [3] * 50 + [1] * 50), SETTINGS)
     assert phase.tolist() == [1] * 50 + [3] * 50 + [1] * 50
 
 
 @pytest.mark.parametrize("noise", [1.0, 30.0])
 @pytest.mark.parametrize("command", [0, 1, 2])
-def test_noise_alone_makes_no_knee(noise: float, command: int) -> None:
+def test_noise_alone_makes_no_breakpoint(noise: float, command: int) -> None:
     pressure = 3e4 + noise * np.random.default_rng(5).standard_normal(40_000)
-    _, phase, _ = find(stream(np.full(40_000, command), pressure), KNEES)
+    _, phase, _ = find(stream(np.full(40_000, command), pressure), SETTINGS)
     assert len(set(phase.tolist())) == 1
 
 
@@ -196,7 +210,7 @@ def test_noise_alone_makes_no_knee(noise: float, command: int) -> None:
 def test_a_cycle_begins_where_the_last_idle_rows_lead(slope: float, block: int) -> None:
     pressure = 1e5 + slope * np.arange(150) + np.random.default_rng(1).normal(0.0, 3.0, 150)
     pressure[100:] = 5e4  # suction has no say in it
-    _, _, level = find(stream([0] * 100 + [1] * 50, pressure), KNEES, block)
+    _, _, level = find(stream([0] * 100 + [1] * 50, pressure), SETTINGS, block)
     assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1, 100]
     for row in (IDLE_ROWS - 1, 100):
         assert level[row] == pytest.approx(1e5 + slope * row, abs=6 + abs(slope))
@@ -204,7 +218,7 @@ def test_a_cycle_begins_where_the_last_idle_rows_lead(slope: float, block: int) 
 
 def test_a_few_idle_rows_give_their_mean() -> None:
     pressure = 1e5 + np.arange(80.0)
-    _, _, level = find(stream([1] * 20 + [0] * 10 + [1] * 50, pressure), KNEES)
+    _, _, level = find(stream([1] * 20 + [0] * 10 + [1] * 50, pressure), SETTINGS)
     assert level[30] == pytest.approx(pressure[20:30].mean())
 
 
@@ -214,13 +228,13 @@ def test_unreadable_rows_have_no_say_in_it() -> None:
         samples["pressure"][row] = 5e5
         samples["quality"][row] = flag
     samples["pressure"][55] = np.nan
-    _, _, level = find(samples, KNEES)
+    _, _, level = find(samples, SETTINGS)
     assert level[60] == 1e5
 
 
 def test_too_short_an_idle_says_nothing() -> None:
     samples = stream([1] * 50 + [0] * 4 + [1] * 50)
-    _, _, level = find(samples, KNEES)
+    _, _, level = find(samples, SETTINGS)
     assert np.isnan(level).all()
 
 
@@ -228,27 +242,27 @@ def test_rows_before_a_break_say_nothing_about_those_after_it() -> None:
     samples = stream([0] * 60 + [1] * 50)
     samples["pressure"][:58] = 0.5e5
     samples["quality"][58] = Quality.CLOCK
-    _, _, level = find(samples, KNEES)
+    _, _, level = find(samples, SETTINGS)
     assert np.flatnonzero(np.isfinite(level)).tolist() == [IDLE_ROWS - 1]
 
 
 @pytest.mark.parametrize("flag", Quality(BREAK))
-def test_a_break_is_no_knee(flag: Quality) -> None:
+def test_a_break_is_no_breakpoint(flag: Quality) -> None:
     falling = 1e5 - 100.0 * np.arange(300)
     samples = stream([1] * 600, np.concatenate([falling, np.full(300, falling[-1])]))
     samples["quality"][300] = flag
-    _, phase, _ = find(samples, KNEES)
+    _, phase, _ = find(samples, SETTINGS)
     assert (phase == Phase.SUCTION).all()
     samples["quality"][300] = 0
-    _, phase, _ = find(samples, KNEES)
+    _, phase, _ = find(samples, SETTINGS)
     assert (phase == Phase.HOLD).any()
 
 
 def two_suctions(falls_for: int, goes_on: int) -> tuple[Samples, int]:
     """Two suctions, and the first row after the second one.
 
-    In the first one the nozzle goes off after 200 rows, and the knee shows. In the second one the
-    pressure falls for ``falls_for`` rows, and suction ends ``goes_on`` rows later.
+    In the first one the nozzle goes off after 200 rows, and the breakpoint shows. In the second one
+    the pressure falls for ``falls_for`` rows, and suction ends ``goes_on`` rows later.
     """
     fall, idle = 1e5 - 300.0 * np.arange(max(falls_for, 200)), np.full(60, 1e5)
     rise = 10.0 * np.arange(1, 301)
@@ -257,36 +271,37 @@ def two_suctions(falls_for: int, goes_on: int) -> tuple[Samples, int]:
     pieces = ((idle, 0), (first, 1), (idle, 2), (idle, 0), (second, 1), (idle, 2), (idle, 0))
     commands = np.concatenate([np.full(len(piece), command) for piece, command in pieces])
     pressure = np.concatenate([piece for piece, _ in pieces])
-    pressure += KNEES.noise * np.random.default_rng(goes_on).standard_normal(len(pressure))
+    pressure += SETTINGS.noise * np.random.default_rng(goes_on).standard_normal(len(pressure))
     return stream(commands, pressure), len(commands) - 2 * len(idle)
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000])
 @pytest.mark.parametrize("goes_on", [2, 5, 8])
-def test_where_suction_ends_before_the_knee_shows_the_level_of_the_last_one_decides(
+def test_where_suction_ends_before_the_breakpoint_shows_the_level_of_the_last_one_decides(
     goes_on: int, block: int
 ) -> None:
     samples, end = two_suctions(200, goes_on)
-    knees = replace(KNEES, off_shift=8)
-    _, phase, level = find(samples, knees, block)
-    acted = end - goes_on - knees.off_shift
+    detector = replace(SETTINGS, off_shift=8)
+    _, phase, level = find(samples, detector, block)
+    acted = end - goes_on - detector.off_shift
     assert (phase[acted - 60 : acted - 3] == Phase.SUCTION).all()
     assert (phase[acted + 3 : end] == Phase.HOLD).all()
     assert (phase[end : end + 60] == Phase.BLOW_OFF).all()
-    assert np.isfinite(level[61:end]).sum() == 2  # the knee of the first one, and the idle before
+    # The breakpoint of the first one, and the idle before.
+    assert np.isfinite(level[61:end]).sum() == 2
 
 
 @pytest.mark.parametrize("block", [1, 1000])
-def test_a_pressure_below_that_level_for_long_without_a_knee_says_nothing(block: int) -> None:
+def test_a_pressure_below_that_level_for_long_without_a_breakpoint_says_nothing(block: int) -> None:
     samples, end = two_suctions(260, 0)
-    _, phase, _ = find(samples, replace(KNEES, off_shift=8), block)
+    _, phase, _ = find(samples, replace(SETTINGS, off_shift=8), block)
     assert (phase[end - 260 : end] == Phase.SUCTION).all()
 
 
-def test_a_jump_is_no_knee() -> None:
+def test_a_jump_is_no_breakpoint() -> None:
     samples = stream([1] * 600, 1e5 - 100.0 * np.arange(600))
     samples["pressure"][300:] += 2500.0
-    _, phase, level = find(samples, KNEES)
+    _, phase, level = find(samples, SETTINGS)
     assert (phase == Phase.SUCTION).all()
     assert not np.isfinite(level[1:]).any()
 
@@ -297,32 +312,34 @@ def test_a_sensor_that_is_slower_than_the_rows_hides_no_switch(name: str, rows: 
     samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",) if name == "gripper" else (), 1)
     samples = samples.copy()
     samples["pressure"] = np.repeat(samples["pressure"][::rows], rows)[: len(samples)]
-    assert len(found_where_true(samples, truth, rigs.knees(name))) > 3
+    assert len(found_where_true(samples, truth, rigs.detector(name))) > 3
 
 
-def test_a_line_that_rings_does_not_hide_the_knee() -> None:
+def test_a_line_that_rings_does_not_hide_the_breakpoint() -> None:
     """Pressure may rise as fast as if it jumped, but it takes some rows for it."""
     rise = [2.4, 9.1, 16.6, 25.1, 29.2, 29.4, 28.0, 25.2, 22.7, 22.9, 23.9, 26.0, 28.8, 29.8]
     ringing = [*rise, 30.0, 28.5, 26.5, 24.0, 21.4, 20.1, *np.full(280, 20.0)]  # as on a gripper
     falling = -0.42 * np.arange(-300, 1)
     mbar = 261.0 + np.concatenate([falling, ringing])
     noise = np.random.default_rng(0).normal(0.0, 0.31, len(mbar))
-    knees = Knees(window=11, noise=31.0, off_shift=0, on_shift=9, settled=36, again=36, longest=60)
-    _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), knees)
-    (knee,) = np.flatnonzero(np.diff(phase)) + 1
-    assert phase[knee] == Phase.HOLD
-    assert abs(int(knee) - 301) <= 4
+    detector = DetectorSettings(
+        window=11, noise=31.0, off_shift=0, on_shift=9, settled=36, again=36, longest=60
+    )
+    _, phase, _ = find(stream([1] * len(mbar), 100.0 * (mbar + noise)), detector)
+    (break_row,) = np.flatnonzero(np.diff(phase)) + 1
+    assert phase[break_row] == Phase.HOLD
+    assert abs(int(break_row) - 301) <= 4
 
 
 def test_the_nozzle_may_go_off_again_before_a_valve_could_have_followed_a_command() -> None:
     """It acts at once where the air saving switches; only lines ring."""
     slopes = np.repeat([-100.0, 20.0, -100.0, 20.0], [300, 100, 35, 200])  # Pa per row
     samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
-    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
-    _, phase, level = find(samples, KNEES)
-    knees = np.flatnonzero(np.isfinite(level[1:])) + 1
-    assert phase[knees].tolist() == [Phase.HOLD, Phase.SUCTION, Phase.HOLD]
-    assert knees == pytest.approx([300, 400, 435], abs=3)
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, SETTINGS.noise, len(slopes))
+    _, phase, level = find(samples, SETTINGS)
+    detector = np.flatnonzero(np.isfinite(level[1:])) + 1
+    assert phase[detector].tolist() == [Phase.HOLD, Phase.SUCTION, Phase.HOLD]
+    assert detector == pytest.approx([300, 400, 435], abs=3)
 
 
 def on_other_tubes(seed: int) -> tuple[PlcSettings, DataSet]:
@@ -347,38 +364,38 @@ def test_a_tube_that_rings_does_not_switch_the_nozzle(seed: int, fault: str) -> 
     plc, data = on_other_tubes(seed)
     parts = zip(*with_truth(plc, SECONDS, [parse_fault(fault)], seed), strict=True)
     samples, truth = (np.concatenate(column) for column in parts)
-    knees = expected_knees(coefficients(data), data.sensor.noise_mbar * MBAR)
-    assert len(found_where_true(samples, truth, knees)) >= 10
+    detector = expected_detector(coefficients(data), data.sensor.noise_mbar * MBAR)
+    assert len(found_where_true(samples, truth, detector)) >= 10
 
 
-def test_no_knee_is_near_the_level_of_the_last() -> None:
+def test_no_breakpoint_is_near_the_level_of_the_last() -> None:
     """The slope breaks as it does where the nozzle goes on, but the pressure has hardly risen."""
     slopes = np.repeat([-100.0, 100.0, -30.0, 10.0, -100.0], [300, 40, 40, 400, 200])  # Pa per row
     samples = stream([1] * len(slopes), 9e4 + np.cumsum(slopes))
-    samples["pressure"] += np.random.default_rng(0).normal(0.0, KNEES.noise, len(slopes))
+    samples["pressure"] += np.random.default_rng(0).normal(0.0, SETTINGS.noise, len(slopes))
     for apart, first_on in ((0.0, 340), (5000.0, 780)):
-        _, phase, _ = find(samples, replace(KNEES, on_shift=0, apart=apart))
+        _, phase, _ = find(samples, replace(SETTINGS, on_shift=0, apart=apart))
         on = np.flatnonzero((phase[1:] == Phase.SUCTION) & (phase[:-1] == Phase.HOLD)) + 1
         assert on[0] == pytest.approx(first_on, abs=3)
 
 
-def test_knees_are_apart_where_the_line_rings_and_by_less_than_the_hysteresis() -> None:
-    assert rigs.knees("test_rig").apart == 0.0
-    assert rigs.knees("gripper").apart > 20.0 * MBAR
+def test_breakpoints_are_apart_where_the_line_rings_and_by_less_than_the_hysteresis() -> None:
+    assert rigs.detector("test_rig").apart == 0.0
+    assert rigs.detector("gripper").apart > 20.0 * MBAR
     theta = rigs.theta("gripper")
     theta[c.H1_LOW] = theta[c.H1] - 60.0 * MBAR
-    assert expected_knees(theta, rigs.knees("gripper").noise).apart <= 40.0 * MBAR
+    assert expected_detector(theta, rigs.detector("gripper").noise).apart <= 40.0 * MBAR
 
 
-def test_a_swing_that_the_model_does_not_show_is_no_knee() -> None:
+def test_a_swing_that_the_model_does_not_show_is_no_breakpoint() -> None:
     """The window is then as long as the swing: over that a line that rings is level."""
     plc, data = on_other_tubes(4)
     parts = zip(*with_truth(plc, SECONDS, [], 4), strict=True)
     samples, truth = (np.concatenate(column) for column in parts)
     theta, noise = coefficients(data), data.sensor.noise_mbar * MBAR
-    rings = replace(expected_knees(theta, noise), apart=0.0)
+    rings = replace(expected_detector(theta, noise), apart=0.0)
     theta[[c.NEAR_RESISTANCE, c.RESISTANCE]] *= 30.0
-    damped = expected_knees(theta, noise)
+    damped = expected_detector(theta, noise)
     assert damped.apart == 0.0
     assert damped.window >= 3 * rings.window
     with pytest.raises(AssertionError, match="never were"):
@@ -396,7 +413,7 @@ def found_late(name: str, factor: float) -> tuple[float, float]:
     samples, truth = (np.concatenate(column) for column in parts)
     theta = rigs.theta(name)
     theta[c.SENSOR_LAG] *= factor
-    _, phase, _ = find(samples, expected_knees(theta, rigs.knees(name).noise))
+    _, phase, _ = find(samples, expected_detector(theta, rigs.detector(name).noise))
     suction = samples["commands"] == Command.SUCTION
     true, found = (switches(on, suction) for on in (truth["nozzle"] == 1, phase == Phase.SUCTION))
     off, on = (
@@ -419,11 +436,11 @@ def test_in_rows_further_apart_each_switch_is_found_at_its_time(name: str, every
     samples, truth = rigs.recorded(name, SECONDS, ("leakage=2",))
     samples, truth = samples[::every].copy(), truth[::every]
     samples["sequence"] = np.arange(len(samples))
-    knees = knees_of(rigs.config(name).data, sampling_ms(samples))
-    assert knees.period == pytest.approx(every * MS)
-    late = found_where_true(samples, truth, knees)
+    detector = detector_of(rigs.config(name).data, sampling_ms(samples))
+    assert detector.period == pytest.approx(every * MS)
+    late = found_where_true(samples, truth, detector)
     assert len(late) >= 6
-    assert max(map(abs, late)) <= 5  # rows; the port's step pulls a knee forward
+    assert max(map(abs, late)) <= 5  # rows; the port's step pulls a breakpoint forward
     assert max(late) - min(late) <= 5
 
 
@@ -433,13 +450,13 @@ def test_in_rows_further_apart_each_switch_is_found_at_its_time(name: str, every
 @settings(max_examples=30)
 @given(st.floats(1.0, 5000.0), st.sampled_from(rigs.NAMES))
 def test_the_window_has_its_bounds(noise: float, name: str) -> None:
-    knees = expected_knees(rigs.theta(name), noise)
-    assert SHORTEST_WINDOW <= knees.window <= LONGEST_WINDOW
-    assert knees.noise == noise
-    assert knees.lag < 2 * LONGEST_WINDOW
+    detector = expected_detector(rigs.theta(name), noise)
+    assert SHORTEST_WINDOW <= detector.window <= LONGEST_WINDOW
+    assert detector.noise == noise
+    assert detector.lag < 2 * LONGEST_WINDOW
 
 
-def test_the_knee_of_a_large_tank_is_flat_but_seen() -> None:
+def test_the_breakpoint_of_a_large_tank_is_flat_but_seen() -> None:
     """Ten times the volume, and a noisy sensor: the slope breaks by 0.04 mbar a row."""
     plc = rigs.config("test_rig").document.section(PlcSettings, "plc").model_dump()
     plc["rig"]["vessel_ml"] *= 10.0
@@ -448,26 +465,27 @@ def test_the_knee_of_a_large_tank_is_flat_but_seen() -> None:
     theta = rigs.theta("test_rig")
     theta[c.VOLUME] *= 10.0
     stream = list(blocks(PlcSettings.model_validate(plc), 58.0))
-    _, phase, _ = find(np.concatenate(stream), expected_knees(theta, 50.0))
+    _, phase, _ = find(np.concatenate(stream), expected_detector(theta, 50.0))
     off = np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION))
     assert off == 2
 
 
 def test_more_noise_takes_a_longer_window() -> None:
     theta = rigs.theta("test_rig")
-    assert expected_knees(theta, 10.0).window < expected_knees(theta, 50.0).window
+    assert expected_detector(theta, 10.0).window < expected_detector(theta, 50.0).window
 
 
 @given(st.integers(1, 400))
-def test_a_row_is_held_back_only_where_a_knee_may_be(block: int) -> None:
-    finder = PhaseFinder(replace(KNEES, window=12))
+def test_a_row_is_held_back_only_where_a_breakpoint_may_be(block: int) -> None:
+    finder = PhaseFinder(replace(SETTINGS, window=12))
     commands = [0] * 300 + [1] * 700 + [0] * 100 + [1] * 20 + [2] * 100
-    first = 300 + finder.knees.settled + finder.knees.window + 1  # row that may be at a knee
+    # Row that may be at a breakpoint.
+    first = 300 + finder.detector.settled + finder.detector.window + 1
     pushed = given_out = 0
     for part in rigs.cut(stream(commands), block):
         pushed += len(part)
         given_out += len(finder.push(part)[0])
-        searched = max(pushed - finder.knees.window, first)
+        searched = max(pushed - finder.detector.window, first)
         assert given_out == (min(pushed, searched) if pushed <= 1000 else pushed)
     assert given_out == len(commands)
 
@@ -475,7 +493,7 @@ def test_a_row_is_held_back_only_where_a_knee_may_be(block: int) -> None:
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_no_row_is_held_back_longer_than_the_lag(name: str) -> None:
     samples, _ = rigs.recorded(name, SECONDS)
-    finder = PhaseFinder(rigs.knees(name))
+    finder = PhaseFinder(rigs.detector(name))
     pushed = given_out = longest = 0
     for part in rigs.cut(samples, 10):
         pushed += len(part)
@@ -483,20 +501,20 @@ def test_no_row_is_held_back_longer_than_the_lag(name: str) -> None:
         longest = max(longest, pushed - given_out)
         if part["commands"][-1] != Command.SUCTION:
             assert given_out == pushed
-    assert finder.knees.window <= longest <= finder.knees.lag
+    assert finder.detector.window <= longest <= finder.detector.lag
 
 
 def test_a_slow_sensor_takes_a_longer_window() -> None:
     theta = rigs.theta("test_rig")
-    as_built = expected_knees(theta, 31.0).window
+    as_built = expected_detector(theta, 31.0).window
     theta[c.SENSOR_LAG] = 25e-3
-    assert as_built + 5 < expected_knees(theta, 31.0).window <= LONGEST_WINDOW
+    assert as_built + 5 < expected_detector(theta, 31.0).window <= LONGEST_WINDOW
 
 
 @pytest.mark.parametrize("name", rigs.NAMES)
 def test_as_it_should_be_the_window_is_as_wide_as_needed(name: str) -> None:
     samples, _ = rigs.recorded(name, SECONDS)
-    assert as_wide_as_needed(rigs.knees(name), rigs.cut(samples, 1000)) == rigs.knees(name)
+    assert select_window(rigs.detector(name), rigs.cut(samples, 1000)) == rigs.detector(name)
 
 
 @pytest.mark.parametrize(("name", "lag"), [("test_rig", 50), ("gripper", 100)])
@@ -504,11 +522,11 @@ def test_where_a_sensor_is_too_slow_for_its_window_a_wider_one_sees_more(
     name: str, lag: int
 ) -> None:
     samples, _ = rigs.recorded(name, SECONDS, (f"sensor_lag={lag}",))
-    wider = as_wide_as_needed(rigs.knees(name), [samples])
-    assert rigs.knees(name).window < wider.window <= rigs.knees(name).longest
-    assert as_wide_as_needed(rigs.knees(name), rigs.cut(samples, 37)) == wider
+    wider = select_window(rigs.detector(name), [samples])
+    assert rigs.detector(name).window < wider.window <= rigs.detector(name).longest
+    assert select_window(rigs.detector(name), rigs.cut(samples, 37)) == wider
     few, most = (
         int(np.count_nonzero((phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION)))
-        for _, phase, _ in (find(samples, knees) for knees in (rigs.knees(name), wider))
+        for _, phase, _ in (find(samples, detector) for detector in (rigs.detector(name), wider))
     )
     assert few < most >= SECONDS // 3.2 - 1  # cycles are 3.2 s long

@@ -14,11 +14,11 @@ from twin.calibration.fit import Fitted
 from twin.calibration.parameters import Free
 from twin.calibration.readings import read
 from twin.calibration.thresholds import decided
-from twin.model import dense_solver as strides
+from twin.model import dense_solver
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.parts import Cups, Tube
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import detector_of
 from twin.monitor.switching_detector import PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
@@ -64,7 +64,7 @@ def recorded(seed: int) -> tuple[DataSet, Samples, tuple[tuple[int, bool], ...]]
     samples["commands"] = np.concatenate(pieces)
     samples["sequence"] = np.arange(len(samples))
     samples["time_ns"] = samples["host_ns"] = 1_000_000 * samples["sequence"]
-    phase, expected = strides.simulate(
+    phase, expected = dense_solver.simulate(
         theta, np.full(len(samples), MS), np.ascontiguousarray(samples["commands"])
     )
     samples["pressure"] = expected + NOISE * rng.standard_normal(len(samples))
@@ -105,7 +105,7 @@ def as_commissioned(data: DataSet, samples: Samples) -> DataSet:
 
 def not_seen(data: DataSet, samples: Samples, acts: tuple[tuple[int, bool], ...]) -> int:
     """How many switchings the twin of ``data`` does not see within 15 ms while it runs."""
-    finder = PhaseFinder(knees_of(data))
+    finder = PhaseFinder(detector_of(data))
     phase = np.concatenate([finder.push(samples)[1], finder.flush()[1]])
     suction = samples["commands"] == Command.SUCTION
     on = phase == Phase.SUCTION

@@ -77,16 +77,16 @@ def device(seed: int, cycles: int) -> Device:
     rig = rig.model_copy(update={"program": rig.program.model_copy(update=PROGRAM)})
     healthy, smallest = config.monitor.healthy, config.monitor.smallest_mbar
     isolation, baseline = Isolation.of(config.data, healthy, days=1e9), Baseline(healthy)
-    teller = KeyFigures(config.data, watch=config.monitor)
+    key_figure_source = KeyFigures(config.data, watch=config.monitor)
     scores, farthest, cosines, shown, key_figures = [], [], np.eye(0), 0, []
     for look in _looks(config, rig, (LEARNED + cycles) * CYCLE_S, seed):
-        if (cycle_figures := teller.take(look.cycle)) is not None:
+        if (cycle_figures := key_figure_source.take(look.cycle)) is not None:
             key_figures.append([cycle_figures.measured[name] for name in LIMITED])
-        (residual,) = isolation.hear([look])
+        (residual,) = isolation.extract([look])
         if residual is None:
             continue
         isolation.judge(residual)
-        scored, normal = isolation.heard
+        scored, normal = isolation.last_scores
         cosines = scored.alike()
         scores.append(normal)
         normal = baseline.normal(look.figures, smallest)

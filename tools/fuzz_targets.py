@@ -415,9 +415,9 @@ def upload(data: bytes) -> str:
 class Deaf(Ejector):
     """An ejector of a page that stores nothing and has no listener."""
 
-    def ask(self, alarm: str, deed: str, who: str, seconds: float) -> int:
+    def ask(self, alarm: str, action: str, who: str, seconds: float) -> int:
         """As a database would take it."""
-        return len(json.dumps([alarm, deed, who, seconds], ensure_ascii=False).encode())
+        return len(json.dumps([alarm, action, who, seconds], ensure_ascii=False).encode())
 
 
 def _ejector(folder: Path) -> Ejector:

@@ -9,19 +9,19 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.events import Event, Kind
-from twin.model import dense_solver as strides
+from twin.model import dense_solver
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.dense_solver import DenseSolver
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import detector_of
 from twin.monitor.gaps import ShortGaps
 from twin.monitor.monitor import Monitor, in_order
 from twin.monitor.rows import TimeSteps
 from twin.monitor.staleness import Listening
 from twin.monitor.surroundings import are_told, following, stretches
-from twin.monitor.switching_detector import Found, Knees, PhaseFinder
+from twin.monitor.switching_detector import DetectorSettings, Found, PhaseFinder
 from twin.signals import SAMPLE, TICK, Command, Phase, Samples, Ticks
 
 REPLAYED = 60_000  # rows that a replay takes at once: work on many cycles uses the caches well
@@ -63,7 +63,7 @@ class Twin:
     """
 
     theta: Theta
-    knees: Knees
+    detector: DetectorSettings
     terms: Sequence[Term] = ()
     nozzle: npt.NDArray[np.uint8] | None = None
     _solver: DenseSolver = field(default_factory=DenseSolver)
@@ -71,14 +71,14 @@ class Twin:
     _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
-        self._finder = PhaseFinder(self.knees, self.nozzle)
+        self._finder = PhaseFinder(self.detector, self.nozzle)
         self._surrounded_theta = self.theta  # coefficients with the measured surroundings
         self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
 
     @classmethod
     def of(cls, data: DataSet) -> "Twin":
         """The twin of a data set."""
-        return cls(coefficients(data), knees_of(data), data.terms)
+        return cls(coefficients(data), detector_of(data), data.terms)
 
     def advance(self, block: Samples) -> tuple[Samples, Ticks]:
         """Take a block; returns the settled rows with their ticks."""
@@ -107,7 +107,7 @@ class Twin:
         for rows, surroundings in self._surrounded(samples, ticks):
             self._surrounded_theta = following(self._surrounded_theta, surroundings)
             inputs, outputs = (dt[rows], phase[rows], level[rows]), (expected[rows], signals[rows])
-            strides.advance(self._solver, self._surrounded_theta, *inputs, *outputs)
+            dense_solver.advance(self._solver, self._surrounded_theta, *inputs, *outputs)
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
         if len(samples):
@@ -124,8 +124,8 @@ class Twin:
 def compiled(data: DataSet) -> Twin:
     """A twin with compiled code: without a cache compiling takes seconds, so it is done first."""
     twin = Twin.of(data)
-    twin.advance(np.zeros(3 * twin.knees.lag, SAMPLE))
-    return Twin(twin.theta, twin.knees, twin.terms)
+    twin.advance(np.zeros(3 * twin.detector.lag, SAMPLE))
+    return Twin(twin.theta, twin.detector, twin.terms)
 
 
 def run(

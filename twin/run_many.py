@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 
 from twin.errors import TwinError
 
-Told = Callable[[str, str], None]  # takes the loop's name and a text
+Reporter = Callable[[str, str], None]  # takes the loop's name and a text
 
 
-def run_together(loops: Mapping[str, Callable[[], None]], report: Told) -> list[str]:
+def run_together(loops: Mapping[str, Callable[[], None]], report: Reporter) -> list[str]:
     """Run every named loop to its end; returns the names of those that failed.
 
     ``report`` gets the reason of a failure at once, in the loop's thread.

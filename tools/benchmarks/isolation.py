@@ -135,9 +135,9 @@ def heard(
             CycleView(cycle, None, figures(cycle, twin.theta), cycle.complete and cycle.settled)
             for cycle in cutter.push(rows, ticks)
         ]
-        for residual in isolation.hear(views):
+        for residual in isolation.extract(views):
             if residual and isolation.judge(residual) is not None:
-                yield isolation.heard
+                yield isolation.last_scores
 
 
 def _watched(

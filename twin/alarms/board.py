@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from twin.alarms.rules import Priority, Rule
-from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, Kept, State
+from twin.alarms.state import SECOND_NS, Alarm, AlarmAction, Change, Kept, State
 from twin.errors import ConfigError
 
 SUPPRESSION = "suppression"  # who acknowledged an alarm that was never announced
@@ -30,7 +30,9 @@ class Board:
             if alarm.rule.value in values or not alarm.rests:
                 changes += alarm.see(now, values.get(alarm.rule.value, math.nan))
         suppressions = list(self._apply_suppression(now))
-        suppressed = {change.alarm for change in suppressions if change.deed is Deed.SUPPRESSED}
+        suppressed = {
+            change.alarm for change in suppressions if change.action is AlarmAction.SUPPRESSED
+        }
         # An alarm suppresses another one even when both are raised at the same moment.
         changes = [
             replace(change, announced=False) if change.alarm in suppressed else change
@@ -140,7 +142,7 @@ class Diary:
     def take(self, change: Change) -> list[Episode]:
         """The new state of each episode that a change begins or alters."""
         before = self._going_on.pop(change.alarm, [])
-        if change.deed is Deed.RAISED:
+        if change.action is AlarmAction.RAISED:
             new = Episode(change.alarm, change.time_ns, raised_as=change.alarm)
             self._going_on[change.alarm] = [*before, new]
             return [new]
@@ -180,13 +182,13 @@ def merge_evidence(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> dict
 
 def _after_change(episode: Episode, change: Change) -> Episode:
     """The episode after a change of its alarm; an acknowledgement covers all its episodes."""
-    if change.deed is Deed.CLEARED and episode.cleared_ns is None:
+    if change.action is AlarmAction.CLEARED and episode.cleared_ns is None:
         cleared = replace(episode, cleared_ns=change.time_ns)
         if change.untold:
             cleared = replace(cleared, acknowledged_ns=change.time_ns, acknowledged_by=SUPPRESSION)
         return cleared
-    if change.deed is Deed.ACKNOWLEDGED:
+    if change.action is AlarmAction.ACKNOWLEDGED:
         return replace(episode, acknowledged_ns=change.time_ns, acknowledged_by=change.who)
-    if change.deed is Deed.RENAMED:
+    if change.action is AlarmAction.RENAMED:
         return replace(episode, alarm=change.to)
     return episode

@@ -25,7 +25,7 @@ from sqlalchemy import (
 from twin.alarms.board import Comment, Episode
 from twin.alarms.loop import Before, News
 from twin.alarms.requests import LimitChange, Request
-from twin.alarms.state import Deed, Kept
+from twin.alarms.state import AlarmAction, Kept
 from twin.assets.engine import Database, Purpose
 from twin.assets.unit import Unit, of_unit, unit_columns
 from twin.errors import ConfigError
@@ -170,10 +170,12 @@ class Store(Database):
 
     # --- people ---------------------------------------------------------------------------------
 
-    def ask(self, unit: Unit, alarm: str, deed: Deed, who: str, seconds: float = 0.0) -> int:
+    def ask(
+        self, unit: Unit, alarm: str, action: AlarmAction, who: str, seconds: float = 0.0
+    ) -> int:
         """Store a request to a unit's alarm; returns its number, by which to get the answer."""
         values: dict[str, Any] = {"asset_type": unit.type, "asset_id": unit.id, "alarm": alarm}
-        values |= {"deed": deed.value, "who": who, "asked_ns": self._clock(), "seconds": seconds}
+        values |= {"deed": action.value, "who": who, "asked_ns": self._clock(), "seconds": seconds}
         with self._writing() as connection:
             result = connection.execute(REQUEST.insert().values(values).returning(REQUEST.c.id))
             return int(result.scalar_one())
@@ -307,4 +309,4 @@ def _episode(row: Row[Any]) -> Episode:
 
 
 def _request(row: Row[Any]) -> Request:
-    return Request(row.id, row.alarm, Deed(row.deed), row.who, row.asked_ns, row.seconds)
+    return Request(row.id, row.alarm, AlarmAction(row.deed), row.who, row.asked_ns, row.seconds)

@@ -98,8 +98,8 @@ class LimitChanges:
         if self._monitor is None:
             return
         self._monitor.adjust(self._limits.watch)
-        if isinstance(self._monitor.teller, KeyFigures):
-            self._monitor.teller.limits = self._limits.limits
+        if isinstance(self._monitor.key_figure_source, KeyFigures):
+            self._monitor.key_figure_source.limits = self._limits.limits
 
 
 def change_words(change: LimitChange) -> str:

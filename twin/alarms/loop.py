@@ -13,7 +13,7 @@ from twin.alarms.board import Board, Diary, Episode, merge_evidence
 from twin.alarms.causes import CAUSES, UNLISTED, catalogue_evidence, cause_or_unlisted, value_of
 from twin.alarms.requests import LimitChange, Request, grant
 from twin.alarms.rules import Rule
-from twin.alarms.state import Alarm, Change, Deed, Kept
+from twin.alarms.state import Alarm, AlarmAction, Change, Kept
 from twin.alarms.text import SUPPRESSIONS, event_of, is_reportable, plain
 from twin.alarms.watch import STREAM, deviating, evidence, values
 from twin.errors import TwinError
@@ -294,12 +294,12 @@ class Alarms:
             self._record(episodes)
             alarm = self.board[change.to or change.alarm]
             entry = self._evidence.get(alarm.rule.value, {})
-            if change.deed is Deed.RAISED:
+            if change.action is AlarmAction.RAISED:
                 self._record(self._diary.note(change.alarm, entry))
-            elif change.deed is Deed.RENAMED:
+            elif change.action is AlarmAction.RENAMED:
                 self._record(self._diary.note(change.to, entry))
                 self._store_state(self.board[change.alarm])
-            if change.deed not in SUPPRESSIONS:  # suppression follows from the other states
+            if change.action not in SUPPRESSIONS:  # suppression follows from the other states
                 self._store_state(alarm)
             if is_reportable(change, alarm):
                 events.append(event_of(change, self._plain(change, episodes), alarm, time_ns))
@@ -310,7 +310,7 @@ class Alarms:
         alarm = self.board[change.to or change.alarm]
         newest = episodes[-1] if episodes else self._diary.newest(alarm.rule.name)
         state = plain(alarm, self._evidence.get(alarm.rule.value, {}), newest)
-        if change.deed is Deed.RENAMED:
+        if change.action is AlarmAction.RENAMED:
             state["left"] = plain(self.board[change.alarm], {}, None)
         return state
 

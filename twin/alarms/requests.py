@@ -3,15 +3,15 @@
 from dataclasses import dataclass
 
 from twin.alarms.board import Board
-from twin.alarms.state import SECOND_NS, Change, Deed
+from twin.alarms.state import SECOND_NS, AlarmAction, Change
 from twin.errors import ConfigError
 
 ASKABLE = (
-    Deed.ACKNOWLEDGED,
-    Deed.SHELVED,
-    Deed.UNSHELVED,
-    Deed.OUT_OF_SERVICE,
-    Deed.IN_SERVICE,
+    AlarmAction.ACKNOWLEDGED,
+    AlarmAction.SHELVED,
+    AlarmAction.UNSHELVED,
+    AlarmAction.OUT_OF_SERVICE,
+    AlarmAction.IN_SERVICE,
 )
 
 
@@ -21,7 +21,7 @@ class Request:
 
     id: int
     alarm: str
-    deed: Deed
+    action: AlarmAction
     who: str
     asked_ns: int
     seconds: float = 0.0
@@ -60,16 +60,16 @@ class LimitChange:
 def grant(board: Board, request: Request, now: int) -> list[Change]:
     """Carry out a request; ConfigError if that is not possible."""
     alarm, who = board[request.alarm], request.who
-    match request.deed:
-        case Deed.ACKNOWLEDGED:
+    match request.action:
+        case AlarmAction.ACKNOWLEDGED:
             return list(alarm.acknowledge(now, who))
-        case Deed.SHELVED:
+        case AlarmAction.SHELVED:
             waited = max(0, now - request.asked_ns) / SECOND_NS
             if waited >= request.seconds:
                 raise ConfigError(f"{request.alarm}: the time to shelve it for is over already")
             return list(alarm.shelve(now, request.seconds - waited, who))
-        case Deed.UNSHELVED:
+        case AlarmAction.UNSHELVED:
             return list(alarm.unshelve(now, who))
-        case Deed.OUT_OF_SERVICE | Deed.IN_SERVICE:
-            return list(alarm.serve(now, request.deed is Deed.IN_SERVICE, who))
-    raise ConfigError(f"{request.deed} is nothing that can be asked of an alarm")
+        case AlarmAction.OUT_OF_SERVICE | AlarmAction.IN_SERVICE:
+            return list(alarm.serve(now, request.action is AlarmAction.IN_SERVICE, who))
+    raise ConfigError(f"{request.action} is nothing that can be asked of an alarm")

@@ -16,7 +16,7 @@ from twin.errors import ConfigError
 SECOND_NS = 1_000_000_000
 
 
-class Deed(StrEnum):
+class AlarmAction(StrEnum):
     """What happened to an alarm."""
 
     RAISED = "raised"
@@ -53,7 +53,7 @@ class Change:
 
     time_ns: int
     alarm: str
-    deed: Deed
+    action: AlarmAction
     who: str = ""
     announced: bool = False
     to: str = ""
@@ -70,7 +70,12 @@ class Kept:
     out_of_service: bool = False
 
 
-_ANNOUNCING = (Deed.RAISED, Deed.UNSHELVED, Deed.UNSUPPRESSED, Deed.IN_SERVICE)
+_ANNOUNCING = (
+    AlarmAction.RAISED,
+    AlarmAction.UNSHELVED,
+    AlarmAction.UNSUPPRESSED,
+    AlarmAction.IN_SERVICE,
+)
 
 
 @dataclass
@@ -144,7 +149,7 @@ class Alarm:
         if self.acknowledged:
             return
         self.acknowledged, self._untold = True, False
-        yield self._change(now, Deed.ACKNOWLEDGED, who)
+        yield self._change(now, AlarmAction.ACKNOWLEDGED, who)
         if self.rule.latching:
             yield from self.see(now)
 
@@ -156,13 +161,13 @@ class Alarm:
                 f"up to {self.rule.longest_shelving_s:g} s; longer: take it out of service",
             )
         self.shelved_until = now + round(seconds * SECOND_NS)
-        yield self._change(now, Deed.SHELVED, who)
+        yield self._change(now, AlarmAction.SHELVED, who)
 
     def unshelve(self, now: int, who: str = "") -> Iterator[Change]:
         """End shelving."""
         if self.shelved_until is not None:
             self.shelved_until = None
-            yield self._change(now, Deed.UNSHELVED, who)
+            yield self._change(now, AlarmAction.UNSHELVED, who)
 
     def suppress(self, now: int, suppressed: bool) -> Iterator[Change]:
         """Begin or end suppression; at the end it clears if its value is back in limits."""
@@ -175,13 +180,15 @@ class Alarm:
             yield from self._turn(now)
         self.suppressed = suppressed
         self._untold &= suppressed
-        yield self._change(now, Deed.SUPPRESSED if suppressed else Deed.UNSUPPRESSED)
+        yield self._change(now, AlarmAction.SUPPRESSED if suppressed else AlarmAction.UNSUPPRESSED)
 
     def serve(self, now: int, in_service: bool, who: str) -> Iterator[Change]:
         """Put it into service, or take it out."""
         if in_service == self.out_of_service:
             self.out_of_service = not in_service
-            yield self._change(now, Deed.IN_SERVICE if in_service else Deed.OUT_OF_SERVICE, who)
+            yield self._change(
+                now, AlarmAction.IN_SERVICE if in_service else AlarmAction.OUT_OF_SERVICE, who
+            )
 
     def become(self, now: int, successor: "Alarm") -> Iterator[Change]:
         """Hand its state to another alarm, the true one; shelving and the like stay with each."""
@@ -195,7 +202,7 @@ class Alarm:
         successor._since = self._since
         self.active, self.acknowledged, self._beyond, self._since = False, True, False, None
         announced = successor.state is State.UNACKNOWLEDGED
-        yield Change(now, self.rule.name, Deed.RENAMED, "", announced, successor.rule.name)
+        yield Change(now, self.rule.name, AlarmAction.RENAMED, "", announced, successor.rule.name)
 
     def keep(self) -> "Kept":
         """The state that outlives the program."""
@@ -215,16 +222,16 @@ class Alarm:
         if self.active:
             self._untold = self.suppressed and self.acknowledged
             self.acknowledged = False
-            yield self._change(now, Deed.RAISED)
+            yield self._change(now, AlarmAction.RAISED)
             return
         untold, self._untold = self._untold, False
         self.acknowledged |= untold
-        yield replace(self._change(now, Deed.CLEARED), untold=untold)
+        yield replace(self._change(now, AlarmAction.CLEARED), untold=untold)
 
-    def _change(self, now: int, deed: Deed, who: str = "") -> Change:
+    def _change(self, now: int, action: AlarmAction, who: str = "") -> Change:
         """A change of this alarm; it is announced if people must be notified of the alarm now."""
-        announced = deed in _ANNOUNCING and self.state is State.UNACKNOWLEDGED
-        return Change(now, self.rule.name, deed, who, announced)
+        announced = action in _ANNOUNCING and self.state is State.UNACKNOWLEDGED
+        return Change(now, self.rule.name, action, who, announced)
 
     def _longest_shelving(self) -> int:
         return round(self.rule.longest_shelving_s * SECOND_NS)

@@ -6,7 +6,7 @@ from typing import Any
 from twin.alarms.advice import action_of
 from twin.alarms.board import Episode
 from twin.alarms.rules import Rule, default_rules
-from twin.alarms.state import SECOND_NS, Alarm, Change, Deed, State
+from twin.alarms.state import SECOND_NS, Alarm, AlarmAction, Change, State
 from twin.alarms.watch import Evidence, quantity
 from twin.events import Event, Kind
 
@@ -19,17 +19,17 @@ STATES = {
     State.SUPPRESSED: "not announced by design, while an alarm of `suppressed_by` is active",
     State.OUT_OF_SERVICE: "a person keeps it from being announced, until it is in service again",
 }
-SUPPRESSIONS = (Deed.SUPPRESSED, Deed.UNSUPPRESSED)
+SUPPRESSIONS = (AlarmAction.SUPPRESSED, AlarmAction.UNSUPPRESSED)
 _DEED_WORDS = {
-    Deed.RAISED: "raised",
-    Deed.CLEARED: "cleared",
-    Deed.ACKNOWLEDGED: "acknowledged",
-    Deed.SHELVED: "shelved",
-    Deed.UNSHELVED: "no longer shelved",
-    Deed.SUPPRESSED: "suppressed by design",
-    Deed.UNSUPPRESSED: "no longer suppressed",
-    Deed.OUT_OF_SERVICE: "taken out of service",
-    Deed.IN_SERVICE: "in service again",
+    AlarmAction.RAISED: "raised",
+    AlarmAction.CLEARED: "cleared",
+    AlarmAction.ACKNOWLEDGED: "acknowledged",
+    AlarmAction.SHELVED: "shelved",
+    AlarmAction.UNSHELVED: "no longer shelved",
+    AlarmAction.SUPPRESSED: "suppressed by design",
+    AlarmAction.UNSUPPRESSED: "no longer suppressed",
+    AlarmAction.OUT_OF_SERVICE: "taken out of service",
+    AlarmAction.IN_SERVICE: "in service again",
 }
 
 
@@ -41,7 +41,7 @@ def table() -> str:
 
 def is_reportable(change: Change, alarm: Alarm) -> bool:
     """Whether to report a change; suppression of an alarm that concerns nobody is not reported."""
-    return change.announced or alarm.concerns or change.deed not in SUPPRESSIONS
+    return change.announced or alarm.concerns or change.action not in SUPPRESSIONS
 
 
 def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str, Any]:
@@ -65,8 +65,8 @@ def plain(alarm: Alarm, evidence: Evidence, episode: Episode | None) -> dict[str
 
 def event_of(change: Change, now: Mapping[str, Any], alarm: Alarm, time_ns: int) -> Event:
     """A change as an event at a PLC time; ``now`` is ``plain`` of the alarm with its new name."""
-    data = {**now, "deed": change.deed.value, "host_ns": change.time_ns, "who": change.who}
-    if change.deed is Deed.RENAMED:
+    data = {**now, "deed": change.action.value, "host_ns": change.time_ns, "who": change.who}
+    if change.action is AlarmAction.RENAMED:
         data["was"] = change.alarm
     kind = Kind.ALARM if change.announced else Kind.ALARM_CHANGED
     return Event(time_ns, kind, _text(change, alarm, now["evidence"]), data)
@@ -78,20 +78,21 @@ def _text(change: Change, alarm: Alarm, evidence: Evidence) -> str:
         return sentence
     rule = alarm.rule
     reason = f": {evidence['words']}" if "words" in evidence else ""
-    consequence = "" if change.deed is Deed.RENAMED else rule.consequence  # the same as before
+    # The same as before.
+    consequence = "" if change.action is AlarmAction.RENAMED else rule.consequence
     advice = " ".join(filter(None, (consequence, action_of(rule, evidence))))
     return f"{sentence} ({rule.priority} priority){reason}. {advice}".rstrip()
 
 
 def _deed(change: Change, alarm: Alarm) -> str:
     """A short sentence about the change."""
-    if change.deed is Deed.RENAMED:
+    if change.action is AlarmAction.RENAMED:
         return f"{change.alarm} is now {change.to}"
     by = f" by {change.who}" if change.who else ""
-    sentence = f"{change.alarm} {_DEED_WORDS[change.deed]}{by}"
-    if change.deed is Deed.SHELVED and alarm.shelved_until is not None:
+    sentence = f"{change.alarm} {_DEED_WORDS[change.action]}{by}"
+    if change.action is AlarmAction.SHELVED and alarm.shelved_until is not None:
         return f"{sentence} for {(alarm.shelved_until - change.time_ns) / SECOND_NS / 60:.3g} min"
-    if change.deed is Deed.RAISED and not change.announced:
+    if change.action is AlarmAction.RAISED and not change.announced:
         return f"{sentence}, not announced: {str(alarm.state).replace('_', ' ')}"
     return sentence
 

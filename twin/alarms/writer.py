@@ -14,7 +14,7 @@ POLL_S = 1.0  # interval at which changes are written and requests are read
 RETRY_S = 5.0  # after the database could not be reached
 
 
-class Keeper:
+class AlarmWriter:
     """Stores the alarms of a unit, in a thread of its own (``twin.alarms.loop.AlarmStorage``).
 
     A failure is reported once, and the changes are held until they can be written. The loop always

@@ -12,7 +12,7 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE, Space
 from twin.calibration.readings import read
-from twin.calibration.stationarity import refuse_changing
+from twin.calibration.stationarity import check_stationary
 from twin.calibration.verdict import Verdict, judge
 from twin.config import Config
 from twin.diagnosis.evidence import collect
@@ -24,7 +24,7 @@ from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.cycles import Cycle, figures, whole
-from twin.monitor.detector_window import as_wide_as_needed
+from twin.monitor.detector_window import select_window
 from twin.monitor.healthy import Healthy, Scatter, sure
 from twin.monitor.measured_supply import SUPPLY, supplied
 from twin.monitor.signal_checks import Contradiction, standing
@@ -71,8 +71,8 @@ def calibrate(
     refuse_rounded(fitted.data, samples)
     progress("what healthy cycles scatter")
     cycles = complete(fitted.data, samples)
-    refuse_unalike(fitted.data, samples, cycles)
-    refuse_unlike(fitted, config.data)
+    check_unchanged(fitted.data, samples, cycles)
+    check_within_type(fitted, config.data)
     progress("judging the fit")
     verdict = judge(Cycles.found(samples[used], fitted.data), fitted.data, read(samples).noise)
     healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
@@ -118,13 +118,13 @@ def refuse_contradicting(cycles: Sequence[Cycle], data: DataSet) -> None:
 def contradictions(cycles: Sequence[Cycle], data: DataSet) -> list[Contradiction]:
     """Signals of a record that its pressure contradicts."""
     twin = Twin.of(data)
-    return standing(cycles, twin.theta, twin.knees)
+    return standing(cycles, twin.theta, twin.detector)
 
 
 def refuse_rounded(data: DataSet, samples: Samples) -> None:
     """ConfigError if a twin of ``data`` would not see the nozzle go off in each cycle."""
-    knees = Twin.of(data).knees
-    if as_wide_as_needed(knees, [samples]) != knees:
+    detector = Twin.of(data).detector
+    if select_window(detector, [samples]) != detector:
         raise ConfigError(
             "the air saving's switching is too round in this log to be seen in each cycle: the"
             f" pressure comes slower than a lag of {data.sensor.lag_ms:.3g} ms explains",
@@ -133,7 +133,7 @@ def refuse_rounded(data: DataSet, samples: Samples) -> None:
         )
 
 
-def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
+def check_within_type(fitted: Fitted, data: DataSet) -> None:
     """ConfigError if the fit is no healthy unit of its type."""
     if fitted.left > MOST_LEFT * MBAR:
         raise ConfigError(
@@ -153,11 +153,11 @@ def refuse_unlike(fitted: Fitted, data: DataSet) -> None:
             )
 
 
-def refuse_unalike(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:
+def check_unchanged(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:
     """ConfigError if something came or went while the log was recorded."""
     theta = coefficients(data)
     cycle_figures = [figures(cycle, theta) for cycle in cycles]
-    refuse_changing(
+    check_stationary(
         Cycles.as_live(samples, data), theta, data.sensor.noise_in_means() * MBAR, cycle_figures
     )
 
@@ -189,7 +189,9 @@ def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[fl
 
     ``untold`` has sigmas of values that no log shows and nobody configured.
     """
-    factor = block_diag(np.linalg.cholesky(fitted.left_open), np.diag([*untold.values()]))
+    factor = block_diag(
+        np.linalg.cholesky(fitted.parameter_covariance), np.diag([*untold.values()])
+    )
     names = [*(free.name for free in fitted.free), *untold]
     return {
         name: tuple(float(f"{change:.4g}") for change in row[: number + 1])

@@ -27,7 +27,7 @@ from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
 from twin.calibration.fit import Fitted, fit_from_afar
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read, rows_by_phase
-from twin.calibration.stationarity import refuse_parted
+from twin.calibration.stationarity import check_one_group
 from twin.calibration.thresholds import decided
 from twin.calibration.verdict import Verdict, judge
 from twin.calibration.wiring import refuse_miswired
@@ -206,7 +206,7 @@ def commission(
         before = complete(guess, samples)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
     used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
-    refuse_parted(Cycles.found(samples, guess))
+    check_one_group(Cycles.found(samples, guess))
     free = free_of(config, readings)
     guesses = starts(
         guess,

@@ -13,7 +13,7 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned, drawn
-from twin.monitor.detector_window import as_wide_as_needed, knees_of
+from twin.monitor.detector_window import detector_of, select_window
 from twin.monitor.offline_switching import Switching, noise_of, switchings
 from twin.monitor.rows import time_steps
 from twin.monitor.switching_detector import PhaseFinder, commanded
@@ -51,7 +51,7 @@ class Cycles:
     def as_live(cls, samples: Samples, data: DataSet) -> "Cycles":
         """Find the phases as the live twin of ``data`` does, synchronised at each breakpoint."""
         theta = coefficients(data)
-        finder = PhaseFinder(as_wide_as_needed(knees_of(data), [samples]))
+        finder = PhaseFinder(select_window(detector_of(data), [samples]))
         early, late = finder.push(samples), finder.flush()
         rows, phase = np.concatenate([early[0], late[0]]), np.concatenate([early[1], late[1]])
         level = np.concatenate([early[2], late[2]]).astype(np.float32).astype(np.float64)

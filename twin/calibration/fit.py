@@ -19,7 +19,7 @@ from twin.calibration.cycles import Both, Cycles
 from twin.calibration.line_discrepancy import with_left_out
 from twin.calibration.parameters import FREE_IN_MARKET, Free, Space
 from twin.calibration.readings import noise_of
-from twin.calibration.residual_covariance import Weights, plain, weighted
+from twin.calibration.residual_covariance import CycleWhitener, plain, weighted
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
@@ -87,7 +87,7 @@ class Problem:
 
     space: Space
     cycles: Cycles | Both
-    weights: Weights
+    weights: CycleWhitener
 
     def residual(self, x: Floats) -> Floats:
         """Residuals of all bins, and distances of ``x`` from the prior.
@@ -171,7 +171,8 @@ class Fitted:
     data: DataSet
     free: tuple[Free, ...]
     covariance: Floats  # of the free parameters, in their units
-    left_open: Floats  # the covariance without the model's discrepancy: other logs may narrow it
+    # The covariance without the model's discrepancy: other logs may narrow it.
+    parameter_covariance: Floats
     prior: Floats  # sigma of each before the log, in its unit
     left: float  # Pa rms of the residual in the fitted cycles
     scaled: npt.NDArray[np.bool_]  # parameters whose logarithm is normally distributed
@@ -355,7 +356,7 @@ def _problem(
     samples: Samples,
     start: _Start,
     noises: Sequence[float],
-    weigh: Callable[[Cycles, float], Weights],
+    weigh: Callable[[Cycles, float], CycleWhitener],
 ) -> Problem:
     """The problem of following the pressure from a start; two ``noises`` (Pa): both pressures."""
     cycles = Cycles.found(samples, start.data)
@@ -428,8 +429,8 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     prior = np.sqrt(np.diag(slopes @ slopes.T))
     first_residual = off[: len(cycles.bins.count), 0]
     rms = float(np.sqrt(np.average(first_residual**2, weights=cycles.bins.count)))
-    left_open = slopes @ plain @ slopes.T
-    return Fitted(best, space.free, covariance, left_open, prior, rms, space.scaled)
+    parameter_covariance = slopes @ plain @ slopes.T
+    return Fitted(best, space.free, covariance, parameter_covariance, prior, rms, space.scaled)
 
 
 def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:

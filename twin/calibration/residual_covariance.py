@@ -31,7 +31,7 @@ LEAST_MORE = 0.1  # cycles beyond one: less than any mean over neighbours that i
 
 
 @dataclass(frozen=True)
-class Weights:
+class CycleWhitener:
     """Whitens residuals cycle by cycle."""
 
     parts: Sequence[tuple[Ints, Covariance]]  # bins of a cycle, and their covariance
@@ -40,14 +40,14 @@ class Weights:
         """Whitened residuals (bins, n) of each cycle; bins without a cycle are left out."""
         return [covariance.white(off[rows]) for rows, covariance in self.parts]
 
-    def followed_by(self, other: "Weights", bins: int) -> "Weights":
+    def followed_by(self, other: "CycleWhitener", bins: int) -> "CycleWhitener":
         """These weights, for a pressure with ``bins``, then those of a second pressure."""
-        return Weights(
+        return CycleWhitener(
             [*self.parts, *((rows + bins, covariance) for rows, covariance in other.parts)]
         )
 
 
-def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
+def plain(cycles: Cycles, noise: float, error: float, late: float) -> CycleWhitener:
     """Weights before the scatter is known: each bin by noise and the model's own error.
 
     That is ``error`` (Pa), and the change of pressure within ``late`` (s).
@@ -59,10 +59,10 @@ def plain(cycles: Cycles, noise: float, error: float, late: float) -> Weights:
         covariance = low_rank(cycles.unsure[rows]) * len(rows_by_cycle)
         add_independent(covariance, errors[rows] ** 2 + noise**2 / bins.count[rows])
         parts.append((rows, Covariance.of(covariance)))
-    return Weights(parts)
+    return CycleWhitener(parts)
 
 
-def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Weights:
+def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> CycleWhitener:
     """Weights for residuals about ``theta``; their errors come from its residuals if ``fitted``.
 
     ``noise`` (Pa) is the sensor's.
@@ -92,7 +92,7 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Wei
         covariance += fading(cycle_error[rows], time, bins.stretch[rows]) + low_rank(scatter[rows])
         add_independent(covariance, noise**2 / bins.count[rows])
         parts.append((rows, Covariance.of(covariance)))
-    return Weights(parts)
+    return CycleWhitener(parts)
 
 
 def _settled(bins: Bins) -> list[Ints]:

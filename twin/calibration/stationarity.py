@@ -46,7 +46,7 @@ class Step:
         return abs(self.size) > SMALLEST and self.errors > SIGNIFICANT
 
 
-def refuse_changing(
+def check_stationary(
     cycles: Cycles, theta: Theta, noise: float, figures: Sequence[Mapping[str, float]]
 ) -> None:
     """ConfigError if an effect comes or goes in ``cycles``.
@@ -66,7 +66,7 @@ def refuse_changing(
         )
 
 
-def refuse_parted(cycles: Cycles) -> None:
+def check_one_group(cycles: Cycles) -> None:
     """ConfigError if the cycles before and after one of them differ clearly, as with two units.
 
     The cycle in which it changes may belong to neither group.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from twin.alarms.database import Store
     from twin.alarms.limit_changes import LimitChanges
     from twin.alarms.loop import Alarms
-    from twin.alarms.state import Alarm, Deed
+    from twin.alarms.state import Alarm, AlarmAction
     from twin.assets.unit import Unit
     from twin.config import Config
     from twin.settings import Document
@@ -215,9 +215,9 @@ def acknowledge(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
     """Acknowledge an alarm: somebody has seen it and takes care."""
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
 
-    _ask(names, Deed.ACKNOWLEDGED, by, _Selection(config, unit, alarms))
+    _ask(names, AlarmAction.ACKNOWLEDGED, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -232,9 +232,9 @@ def shelve(
     by: Who = "",
 ) -> None:
     """Shelve an alarm: do not announce it for a time."""
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
 
-    _ask(names, Deed.SHELVED, by, _Selection(config, unit, alarms), hours * 3600.0)
+    _ask(names, AlarmAction.SHELVED, by, _Selection(config, unit, alarms), hours * 3600.0)
 
 
 @alarms_app.command()
@@ -242,9 +242,9 @@ def unshelve(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
     """End the shelving of an alarm before its time is over."""
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
 
-    _ask(names, Deed.UNSHELVED, by, _Selection(config, unit, alarms))
+    _ask(names, AlarmAction.UNSHELVED, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -252,9 +252,9 @@ def out_of_service(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
     """Take an alarm out of service: do not announce it until ``in-service``."""
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
 
-    _ask(names, Deed.OUT_OF_SERVICE, by, _Selection(config, unit, alarms))
+    _ask(names, AlarmAction.OUT_OF_SERVICE, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -262,9 +262,9 @@ def in_service(
     names: Names, config: ConfigFile = None, unit: UnitId = "", alarms: Url = "", by: Who = ""
 ) -> None:
     """Put an alarm back into service."""
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
 
-    _ask(names, Deed.IN_SERVICE, by, _Selection(config, unit, alarms))
+    _ask(names, AlarmAction.IN_SERVICE, by, _Selection(config, unit, alarms))
 
 
 @alarms_app.command()
@@ -326,14 +326,16 @@ def alarms_of(
 
     from twin.alarms.database import ALARM_DATABASE
     from twin.alarms.database_url import open_chosen
-    from twin.alarms.writer import Keeper  # loads SQLAlchemy only if alarms are stored
+    from twin.alarms.writer import AlarmWriter  # loads SQLAlchemy only if alarms are stored
     from twin.assets.engine import parse_url
     from twin.assets.unit import Unit
 
     parse_url(alarm_settings.url, ALARM_DATABASE)
     open_database = partial(open_chosen, "", document, create=True)
-    keeper = Keeper(open_database, Unit(settings.asset.type, settings.asset.id), say)
-    return lambda: Alarms(by_cause, time.time_ns, keeper.begin(), keeper, time.monotonic_ns)
+    alarm_writer = AlarmWriter(open_database, Unit(settings.asset.type, settings.asset.id), say)
+    return lambda: Alarms(
+        by_cause, time.time_ns, alarm_writer.begin(), alarm_writer, time.monotonic_ns
+    )
 
 
 def limit_changes_of(settings: "Config", alarms: "Alarms") -> "LimitChanges | None":
@@ -350,7 +352,7 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
     """A function that asks the run to acknowledge an alarm; None if alarms are not stored."""
     from twin.alarms.database_url import open_chosen
     from twin.alarms.settings import AlarmSettings
-    from twin.alarms.state import Deed
+    from twin.alarms.state import AlarmAction
     from twin.assets.unit import Unit
 
     if not settings.document.section(AlarmSettings, "alarms").keep:
@@ -359,7 +361,7 @@ def asker_of(settings: "Config") -> "Callable[[str, str], None] | None":
 
     def acknowledge(alarm: str, user: str) -> None:
         with open_chosen("", settings.document, create=True) as store:
-            store.ask(unit, alarm, Deed.ACKNOWLEDGED, user)
+            store.ask(unit, alarm, AlarmAction.ACKNOWLEDGED, user)
 
     return acknowledge
 
@@ -405,33 +407,33 @@ def _standing(
 
 
 def _ask(
-    names: list[str], deed: "Deed", by: str, selection: _Selection, seconds: float = 0.0
+    names: list[str], action: "AlarmAction", by: str, selection: _Selection, seconds: float = 0.0
 ) -> None:
     """Send a request to the run, and wait briefly for its answer; ConfigError if it refuses."""
     board = _board(selection.config)
     for name in names:
-        if deed.value == "shelved":
+        if action.value == "shelved":
             list(board[name].shelve(0, seconds, by))  # refuses what a run would refuse
         board[name]
     with _open(selection.url, selection.config) as store:
         chosen = chosen_unit(store, selection.config, selection.unit)
         requests = dict[int, str]()
         for name in names:
-            requests[store.ask(chosen, name, deed, by or user_here(), seconds)] = name
+            requests[store.ask(chosen, name, action, by or user_here(), seconds)] = name
             if selection.config is not None:
                 details = {"unit": chosen.id or chosen.type, "alarm": name}
                 details |= {"by": by} if by else {}
-                audit_of(selection.config.parent).record(deed, user_here(), **details)
+                audit_of(selection.config.parent).record(action, user_here(), **details)
         refused = [
             refusal
             for number, name in requests.items()
-            if (refusal := _await_answer(store, number, name, deed))
+            if (refusal := _await_answer(store, number, name, action))
         ]
     if refused:
         raise ConfigError("\n".join(refused))
 
 
-def _await_answer(store: "Store", number: int, name: str, deed: "Deed") -> str:
+def _await_answer(store: "Store", number: int, name: str, action: "AlarmAction") -> str:
     """Print that the request is done; return the reason if it is refused."""
     end = time.monotonic() + ANSWER_S
     while (answer := store.answer(number)) is None:
@@ -440,7 +442,7 @@ def _await_answer(store: "Store", number: int, name: str, deed: "Deed") -> str:
             return ""
         time.sleep(LOOK_S)
     if not answer:
-        print(f"{name}: {deed.value.replace('_', ' ')}")
+        print(f"{name}: {action.value.replace('_', ' ')}")
     return answer
 
 

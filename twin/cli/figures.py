@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from twin.figures.database import History, Store
     from twin.figures.key_figures import Figure
     from twin.figures.settings import FigureSettings, Limits
-    from twin.figures.writer import Keeper
+    from twin.figures.writer import FigureWriter
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -335,7 +335,9 @@ def key_figures_of(settings: "Config") -> "KeyFigures":
     return compiled(settings)
 
 
-def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[], Keeper] | None":
+def figure_writer_of(
+    settings: "Config", say: "Callable[[str], None]"
+) -> "Callable[[], FigureWriter] | None":
     """A function that opens the sink of key figures; None unless ``[figures]`` asks for it.
 
     ConfigError for a URL of an unknown kind. The sink reports an unreachable database, and retries.
@@ -346,7 +348,7 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     from twin.figures.database_url import open_chosen
     from twin.figures.retention import Retention
     from twin.figures.settings import FigureSettings
-    from twin.figures.writer import Keeper
+    from twin.figures.writer import FigureWriter
 
     figure_settings = settings.document.section(FigureSettings, "figures")
     if not figure_settings.keep:
@@ -356,7 +358,7 @@ def keeper_of(settings: "Config", say: "Callable[[str], None]") -> "Callable[[],
     open_database = partial(open_chosen, "", settings.document, create=True)
     days = figure_settings.keep_days
     retention = None if days is None else Retention(days, say)
-    return lambda: Keeper(open_database, unit, settings.data.hash, say, retention)
+    return lambda: FigureWriter(open_database, unit, settings.data.hash, say, retention)
 
 
 # --- what the commands share --------------------------------------------------------------------

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from twin.config import Config
     from twin.fleet.engines import Submit
-    from twin.fleet.runner import Told
+    from twin.fleet.runner import Outcome
     from twin.log.reader import Log
     from twin.settings import Document
 
@@ -227,15 +227,15 @@ class _Fleet:
         return config.of_rows(header)
 
 
-def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Told]":
+def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "list[Outcome]":
     """Process logs that are not yet done; print failures and a summary; outcomes in order."""
     from twin.fleet.results_database import open_store
-    from twin.fleet.runner import Told, ask, go
+    from twin.fleet.runner import Outcome, ask, go
 
     pending = ask(work, files, lambda log: fleet.config_of(log, work))
     requests = list(_progress(pending, len(files), "reading logs"))
-    jobs = [job for job in requests if not isinstance(job, Told)]
-    outcomes = [outcome for outcome in requests if isinstance(outcome, Told)]
+    jobs = [job for job in requests if not isinstance(job, Outcome)]
+    outcomes = [outcome for outcome in requests if isinstance(outcome, Outcome)]
     for outcome in outcomes:
         print(f"twin: {outcome.error}", file=sys.stderr)
     for job in jobs:
@@ -258,7 +258,7 @@ def _done(work: str, files: Sequence[Path], fleet: _Fleet, engine: _Engine) -> "
     return sorted(outcomes, key=lambda outcome: position[outcome.log])
 
 
-def _leave(outcomes: "Iterable[Told]") -> None:
+def _leave(outcomes: "Iterable[Outcome]") -> None:
     """Exit as for an unreadable log if any log failed; all others are done."""
     if any(outcome.error for outcome in outcomes):
         raise typer.Exit(SourceError.exit_code)
@@ -287,7 +287,7 @@ def _progress(items: "Iterable[Item]", total: int, label: str) -> "Iterator[Item
     )
 
 
-def _plain(outcomes: "Iterable[Told]", fleet: _Fleet) -> list[dict[str, object]]:
+def _plain(outcomes: "Iterable[Outcome]", fleet: _Fleet) -> list[dict[str, object]]:
     """The outcome of every log for JSON, with its answer."""
     from twin.fleet.results_database import open_store
 

@@ -9,7 +9,7 @@ from twin.errors import ConfigError
 
 if TYPE_CHECKING:
     from twin.config import Config
-    from twin.notifications.data import Teller
+    from twin.notifications.data import MessageSource
     from twin.notifications.dispatch import Outlets
     from twin.notifications.sender import Channel, Lane
     from twin.notifications.settings import MqttSettings, NotificationSettings, Outlet
@@ -53,15 +53,15 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
     channels: dict[str, tuple[Channel, Outlet]] = {}
     uploader = _uploader_of(settings, say)
     if mqtt.host:
-        batch, hear = settings.asset.batch, uploader.hear if uploader else None
-        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=batch, hear_request=hear), mqtt
+        batch, receive = settings.asset.batch, uploader.receive if uploader else None
+        channels["mqtt"] = Mqtt(mqtt, unit, folder, say, batch=batch, on_request=receive), mqtt
     if webhook.url:
         channels["webhook"] = Webhook(webhook, folder, say), webhook
     if notifications:
         channels["email"] = _email_of(settings, notifications, say), notifications.email
 
     def begin(standing: Standing) -> "Outlets":
-        tellers = {"mqtt": _tellers_of(settings, mqtt)} if mqtt.host else {}
+        message_sources = {"mqtt": _message_sources_of(settings, mqtt)} if mqtt.host else {}
         lanes = {"mqtt": _lanes_of(mqtt)}
         if notifications:
             lanes["email"] = _mail_lanes_of(notifications)
@@ -76,7 +76,7 @@ def outlets_of(settings: "Config", say: Say) -> Begin | None:
             senders,
             say,
             restating=restating,
-            tellers=tellers,
+            message_sources=message_sources,
             uploader=uploader,
         )
         outlets.begin(standing)
@@ -132,7 +132,7 @@ def _uploader_of(settings: "Config", say: Say) -> "Uploader | None":
     )
 
 
-def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
+def _message_sources_of(settings: "Config", mqtt: "MqttSettings") -> "list[MessageSource]":
     """Sources of other data for the broker: key figures and values."""
     from twin.assets.unit import Unit
     from twin.notifications.data import Cycles, Values
@@ -140,11 +140,11 @@ def _tellers_of(settings: "Config", mqtt: "MqttSettings") -> "list[Teller]":
     from twin.signals import MBAR
 
     asset = asset_of(Unit(settings.asset.type, settings.asset.id), settings.asset.batch)
-    tellers: list[Teller] = [Cycles(asset)] if mqtt.cycles else []
+    message_sources: list[MessageSource] = [Cycles(asset)] if mqtt.cycles else []
     if mqtt.values is not None:
         ambient = settings.data.ambient.pressure_mbar * MBAR
-        tellers.append(Values(asset, mqtt.values.period_s, ambient))
-    return tellers
+        message_sources.append(Values(asset, mqtt.values.period_s, ambient))
+    return message_sources
 
 
 def _lanes_of(mqtt: "MqttSettings") -> "list[Lane]":

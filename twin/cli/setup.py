@@ -87,9 +87,11 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
         if watch.isolate and judges
         else None
     )
-    teller = key_figures_of(settings) if judges else None
-    monitor = Monitor(watch, twin.theta, teller=teller, isolation=isolation, judges=judges)
-    monitor.reports = ReportWatch(twin.theta, twin.knees) if judges else None
+    key_figure_source = key_figures_of(settings) if judges else None
+    monitor = Monitor(
+        watch, twin.theta, key_figure_source=key_figure_source, isolation=isolation, judges=judges
+    )
+    monitor.reports = ReportWatch(twin.theta, twin.detector) if judges else None
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then times are this machine's
     return twin, monitor

@@ -10,7 +10,7 @@ from threading import Lock
 from typing import TYPE_CHECKING
 
 from twin.cli.console import Console
-from twin.cli.figures import keeper_of
+from twin.cli.figures import figure_writer_of
 from twin.cli.serve import live_rows_of
 from twin.errors import ConfigError
 from twin.extras import require
@@ -42,7 +42,7 @@ def live_sinks(
         {
             "console": lambda: console,
             "OPC UA results": (lambda: results) if results else None,
-            "key figures": keeper_of(settings, complain),
+            "key figures": figure_writer_of(settings, complain),
             "live page": live_rows_of(settings, complain, file),
             "view": view,
             "log": partial(_recorder, file, settings, hil=hil) if file else None,

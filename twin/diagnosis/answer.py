@@ -25,7 +25,7 @@ from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
 from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
-from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
+from twin.diagnosis.residual_covariance import Covariance, ResidualWhitener, covariance
 from twin.diagnosis.search import Search, search, sharpened, stranger
 from twin.diagnosis.unlisted import STRANGE, Unlisted, extended, look
 from twin.diagnosis.unmodelled import Unmodelled
@@ -291,19 +291,19 @@ def _term_found(
 def _signals(log: LogCycles) -> list[dict[str, str]]:
     """Reported or measured signals that contradict the pressure."""
     cycles = (Cycle(number, *log.rows(number), complete=True) for number in range(log.cycles))
-    contradictions = standing(cycles, log.base.theta, log.base.knees)
+    contradictions = standing(cycles, log.base.theta, log.base.detector)
     return [
         {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
         for contradiction in contradictions
     ]
 
 
-def _left_in_all(evidence: Evidence, weights: Weights) -> float:
+def _left_in_all(evidence: Evidence, weights: ResidualWhitener) -> float:
     """Leftover (sigmas) of the twin without causes over all cycles; an odd cycle counts little."""
     return usual_leftover(_left_by_cycle(evidence, weights))
 
 
-def _left_by_cycle(evidence: Evidence, weights: Weights) -> Floats:
+def _left_by_cycle(evidence: Evidence, weights: ResidualWhitener) -> Floats:
     """Chi-square of the twin without causes per residual in each cycle, by weights of all."""
     residuals = white(evidence, weights, [HEALTHY])[: len(weights.bins), 0]
     return left_in_each(evidence, weights, residuals)

@@ -33,15 +33,15 @@ from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
-from twin.monitor.detector_window import as_wide_as_needed, knees_of
+from twin.monitor.detector_window import detector_of, select_window
 from twin.monitor.healthy import Healthy
 from twin.monitor.measured_supply import lower_by
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import least_time_ms
-from twin.monitor.simulated_switching import Seen, seen
+from twin.monitor.simulated_switching import DetectedSwitching, detected_switching
 from twin.monitor.smoothed_nozzle import smoothed
 from twin.monitor.surroundings import medians_of, surrounded
-from twin.monitor.switching_detector import Knees
+from twin.monitor.switching_detector import DetectorSettings
 from twin.monitor.uncertain_data import Shift, shifted
 from twin.quality import UNUSABLE, Quality
 from twin.signals import (
@@ -80,7 +80,7 @@ def at_once(run: Callable[[Item], Result], over: Sequence[Item]) -> list[Result]
         return list(pool.map(run, over))
 
 
-class LeftOpen(NamedTuple):
+class ParameterSensitivity(NamedTuple):
     """Changes of healthy bins (mbar) by each uncertainty of the data set, (bins, uncertainties)."""
 
     nearby: Floats  # linear response to one sigma
@@ -105,7 +105,7 @@ class Evidence:
     noise: float  # mbar, of a row
     bins: Bins
     terms: tuple[Term, ...]  # empirical terms of the data set
-    knees: Knees  # settings of the detector that found the switchings
+    detector: DetectorSettings  # settings of the detector that found the switchings
     uncertain: tuple[Shift, ...]  # uncertainties of the data set, one sigma each
     rows: Ints  # subsampled for interpolation of the expected pressure
     calibrated: Theta  # ``theta`` in the surroundings of the calibration
@@ -113,7 +113,8 @@ class Evidence:
     another_day: bool = True  # the log is of another day than the calibration
     volumes_within: float = 1.0  # accuracy factor (95 %) of the volumes in the data set
     catalogue: Mapping[str, CatalogueEffect] = field(default_factory=dict)  # stored effects
-    _seen: dict[bytes, Seen] = field(default_factory=dict)  # cache by coefficients
+    # Cache by coefficients.
+    _detected_switchings: dict[bytes, DetectedSwitching] = field(default_factory=dict)
 
     @property
     def cycles(self) -> int:
@@ -205,7 +206,7 @@ class Evidence:
         """Measured minus expected pressure (mbar) in each bin, (bins, hypotheses).
 
         ``bases`` are the coefficients that each hypothesis changes, by default the twin's;
-        ``late`` are rows by which its knees are later than they were found.
+        ``late`` are rows by which its breakpoints are later than they were found.
         """
         bases = [self.theta] * len(hypotheses) if bases is None else bases
         pairs = list(zip(bases, hypotheses, strict=True))
@@ -274,14 +275,14 @@ class Evidence:
         return np.array(states).T
 
     @cached_property
-    def left_open(self) -> LeftOpen:
+    def parameter_sensitivity(self) -> ParameterSensitivity:
         """Responses of the twin without causes to each uncertainty of its data set."""
         ups, downs = ([getattr(shift, side) for shift in self.uncertain] for side in ("up", "down"))
         near = [self.theta + NEARBY * (up - self.theta) for up in ups]
         bases = [self.theta, *near, *ups, *downs]
         _, changes = derivatives(self.off([HEALTHY] * len(bases), bases))
         nearby, up, down = np.split(changes, 3, axis=1)
-        return LeftOpen(nearby / NEARBY, up, down)
+        return ParameterSensitivity(nearby / NEARBY, up, down)
 
     def _drawn(self, courses: Sequence[Schedule], phase: Phases) -> Ints:
         """Subsampled rows for interpolation of the pressure expected by these courses."""
@@ -323,7 +324,7 @@ class Evidence:
     def _sensing(
         self, bases: Sequence[Theta], courses: Sequence[Schedule]
     ) -> list[tuple["Sensing", ...]]:
-        """Shifts of the nozzle's time and of the level at a knee, against the calibrated twin.
+        """Shifts of the nozzle's time and of a breakpoint's level, against the calibrated twin.
 
         They depend only on coefficients of jet, line and sensor.
         """
@@ -333,16 +334,19 @@ class Evidence:
         ]
         self.look([*bases, *(theta for stretch in stretches for _, theta in stretch)])
         return [
-            tuple(Sensing.of(row, self.seen(theta), self.seen(base)) for row, theta in stretch)
+            tuple(
+                Sensing.of(row, self.detected_switching(theta), self.detected_switching(base))
+                for row, theta in stretch
+            )
             for base, stretch in zip(bases, stretches, strict=True)
         ]
 
     def _sensing_stretches(self, base: Theta, course: Schedule) -> Schedule:
-        """Coefficients at the knees, with only jet, line and sensor as in a course."""
+        """Coefficients at the breakpoints, with only jet, line and sensor as in a course."""
         if all((theta[_SENSING] == base[_SENSING]).all() for _, theta in course):
             return []
         begins, stretches = [row for row, _ in course], []
-        for number in np.unique(np.searchsorted(begins, self._knees, "right") - 1):
+        for number in np.unique(np.searchsorted(begins, self._switching_rows, "right") - 1):
             row, theta = course[number]
             changed = base.copy()
             changed[_SENSING] = theta[_SENSING]
@@ -368,10 +372,12 @@ class Evidence:
         changed = any(len(course) > 1 for course in courses)
         width = len(sensing) if changed or any(sensing) else 1
         level = np.repeat(self.ticks["level"][rows].astype(np.float64)[:, None], width, axis=1)
-        knees = np.searchsorted(rows, self._knees)
+        switchings = np.searchsorted(rows, self._switching_rows)
         for i, (course, shifts) in enumerate(zip(courses, sensing, strict=True)):
             if shifts:
-                level[knees, i] -= [self._shift_at(knee, shifts)[1] for knee in self._knees]
+                level[switchings, i] -= [
+                    self._shift_at(break_row, shifts)[1] for break_row in self._switching_rows
+                ]
             if len(course) > 1:
                 self._read_anew(rows, level[:, i], course)
         return level
@@ -409,34 +415,34 @@ class Evidence:
 
     def _move(self, phase: Phases, sensing: Sequence["Sensing"]) -> None:
         """Move the switching of one hypothesis, in place."""
-        for knee in self._knees:
-            name = Phase(int(self.ticks["phase"][knee]))
-            known_shift = self._known_shift(knee)
-            earlier, _ = self._shift_at(knee, sensing)
-            acts = max(knee - known_shift - earlier, 0)
-            phase[max(knee - known_shift, 0) : knee] = _OTHER[name]
-            phase[acts:knee] = name
-            late = phase[knee : max(knee, acts)]
+        for break_row in self._switching_rows:
+            name = Phase(int(self.ticks["phase"][break_row]))
+            known_shift = self._known_shift(break_row)
+            earlier, _ = self._shift_at(break_row, sensing)
+            acts = max(break_row - known_shift - earlier, 0)
+            phase[max(break_row - known_shift, 0) : break_row] = _OTHER[name]
+            phase[acts:break_row] = name
+            late = phase[break_row : max(break_row, acts)]
             late[late == name] = _OTHER[name]
 
-    def _known_shift(self, knee: int) -> int:
+    def _known_shift(self, break_row: int) -> int:
         """Rows by which a breakpoint shows late; 0 if it was found by the whole log instead."""
-        name = self.ticks["phase"][knee]
-        shift = self.knees.off_shift if name == Phase.HOLD else self.knees.on_shift
-        return shift if shift and self.ticks["phase"][knee - 1] == name else 0
+        name = self.ticks["phase"][break_row]
+        shift = self.detector.off_shift if name == Phase.HOLD else self.detector.on_shift
+        return shift if shift and self.ticks["phase"][break_row - 1] == name else 0
 
-    def _shift_at(self, knee: int, sensing: Sequence["Sensing"]) -> tuple[int, float]:
+    def _shift_at(self, break_row: int, sensing: Sequence["Sensing"]) -> tuple[int, float]:
         """Rows by which a switching acts earlier, and the level (Pa) by which it is seen higher."""
         begins = [part.row for part in sensing]
-        shift = sensing[int(np.searchsorted(begins, knee, "right")) - 1]
-        is_off = self.ticks["phase"][knee] == Phase.HOLD
-        late = self.knees.off_shift if is_off else self.knees.on_shift
-        is_read = late and not self._known_shift(knee)  # the level is a plain reading
+        shift = sensing[int(np.searchsorted(begins, break_row, "right")) - 1]
+        is_off = self.ticks["phase"][break_row] == Phase.HOLD
+        late = self.detector.off_shift if is_off else self.detector.on_shift
+        is_read = late and not self._known_shift(break_row)  # the level is a plain reading
         above = 0.0 if is_read else shift.off_above if is_off else shift.on_above
         return shift.off if is_off else shift.on, above
 
     @cached_property
-    def _knees(self) -> Ints:
+    def _switching_rows(self) -> Ints:
         """Rows at which the detector saw the air saving switch."""
         phase = self.ticks["phase"]
         rows = np.flatnonzero(np.isfinite(self.ticks["level"]))
@@ -444,21 +450,21 @@ class Evidence:
         inside = [Phase.SUCTION, Phase.HOLD]
         return rows[np.isin(phase[rows], inside) & np.isin(phase[rows - 1], inside)]
 
-    def knee(self, cycle: int, into: Phase) -> int:
+    def switching_row(self, cycle: int, into: Phase) -> int:
         """First row of a cycle at which the detector saw a switching to a phase."""
-        knees = self._knees[self._knees >= self.starts[cycle]]
-        return int(knees[self.ticks["phase"][knees] == into][0])
+        switchings = self._switching_rows[self._switching_rows >= self.starts[cycle]]
+        return int(switchings[self.ticks["phase"][switchings] == into][0])
 
-    def seen(self, theta: Theta) -> Seen:
+    def detected_switching(self, theta: Theta) -> DetectedSwitching:
         """Simulated detection of the switching by the log's detector; cached."""
-        if theta.tobytes() not in self._seen:
+        if theta.tobytes() not in self._detected_switchings:
             self.look([theta])
-        return self._seen[theta.tobytes()]
+        return self._detected_switchings[theta.tobytes()]
 
     def look(self, thetas: Iterable[Theta]) -> None:
         """Simulate and cache the detection of the switching for many coefficients."""
         new = {theta.tobytes(): theta for theta in thetas}
-        new = {key: theta for key, theta in new.items() if key not in self._seen}
+        new = {key: theta for key, theta in new.items() if key not in self._detected_switchings}
         if not new:
             return
         cycle = slice(self.starts[self.judged[0]], self.starts[self.judged[0] + 1])
@@ -466,8 +472,12 @@ class Evidence:
         rows = min(int(LATER * suction), LONGEST_SUCTION)
         thetas = list(new.values())
         lanes = [thetas[i : i + kernel.LANES] for i in range(0, len(thetas), kernel.LANES)]
-        seen_by_lane = at_once(lambda lane: seen(lane, rows, self.knees), lanes)
-        self._seen.update(zip(new, chain.from_iterable(seen_by_lane), strict=True))
+        detected_by_lane = at_once(
+            lambda lane: detected_switching(lane, rows, self.detector), lanes
+        )
+        self._detected_switchings.update(
+            zip(new, chain.from_iterable(detected_by_lane), strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -481,7 +491,7 @@ class Sensing:
     on_above: float
 
     @classmethod
-    def of(cls, row: int, changed: Seen, calibrated: Seen) -> "Sensing":
+    def of(cls, row: int, changed: DetectedSwitching, calibrated: DetectedSwitching) -> "Sensing":
         """Shifts between two simulated detections, ``changed`` and ``calibrated``."""
         return cls(
             row,
@@ -495,7 +505,8 @@ class Sensing:
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _DELAYS = [c.RESPONSE, c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE, c.BLOW_OFF_RESPONSE_OFF]
 _SENSING = [c.SENSOR_LAG, c.SLOW_SENSOR, c.RAMP_UP, c.SLOW_RAMP_UP, c.JET_FULL_AT, c.RAMP_DOWN]
-_SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]  # a drop along the line vanishes at a knee
+# A drop along the line vanishes at a breakpoint.
+_SENSING += [c.NEAR_RESISTANCE, c.RESISTANCE, c.PLACE]
 
 
 def _after(theta: Theta, period: float) -> Theta:
@@ -590,7 +601,7 @@ def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
     blocks = read_again(blocks)
     theta = coefficients(config.data)
     sampling = sampling_ms(max(blocks, key=len, default=np.empty(0, SAMPLE)))
-    knees = knees_of(config.data, sampling)
+    detector = detector_of(config.data, sampling)
     nothing = Evidence(
         theta=theta,
         begin_ns=0,
@@ -604,10 +615,10 @@ def read_cycles(config: Config, blocks: Iterable[Samples]) -> LogCycles:
         healthy=config.monitor.healthy,
         volumes_within=config.data.system.volumes_within_factor,
         noise=config.data.sensor.noise_in_means(sampling),
-        bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), [], knees),
+        bins=_binned(np.empty(0, SAMPLE), np.empty(0, TICK), np.zeros(1, np.int64), [], detector),
         rows=np.empty(0, np.int64),
         terms=config.data.terms,
-        knees=knees,
+        detector=detector,
         uncertain=tuple(shifted(config.data, config.monitor.healthy)),
         calibrated=theta,
         catalogue=config.data.catalogue,
@@ -629,7 +640,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
     """The complete cycles of a log for the twin of ``base``, in the log's surroundings."""
     medians = medians_of(blocks)
     theta = surrounded(base.theta, medians)
-    knees = as_wide_as_needed(base.knees, _Bridged(blocks))
+    detector = select_window(base.detector, _Bridged(blocks))
     base = replace(
         base,
         theta=theta,
@@ -638,14 +649,14 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
             for up, down, tied in base.uncertain
         ),
         told=frozenset(medians),
-        knees=knees,
+        detector=detector,
         begin_ns=next((int(block["time_ns"][0]) for block in blocks if len(block)), 0),
-        _seen={},  # depends on the settings of the detector
+        _detected_switchings={},  # depends on the settings of the detector
     )
     begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
-    told_knees, nozzle = smoothed(theta, knees, _Bridged(blocks))
-    twin = Twin(base.theta, told_knees, base.terms, nozzle)
+    told_detector, nozzle = smoothed(theta, detector, _Bridged(blocks))
+    twin = Twin(base.theta, told_detector, base.terms, nozzle)
     for cycle in cut(twin.over(_Bridged(blocks)), math.inf):
         if not cycle.complete:
             continue
@@ -710,23 +721,23 @@ def _of_rows(
         numbers=numbers,
         judged=judged,
         figures=figures,
-        bins=_binned(samples, ticks, starts, judged, base.knees),
+        bins=_binned(samples, ticks, starts, judged, base.detector),
         rows=drawn_rows(samples, ticks),
     )
 
 
 def _binned(
-    samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int], knees: Knees
+    samples: Samples, ticks: Ticks, starts: Ints, judged: Sequence[int], detector: DetectorSettings
 ) -> Bins:
     """Bins of the rows of judged cycles that can be compared."""
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     usable &= np.isfinite(ticks["expected"])
     usable &= np.isin(np.searchsorted(starts, np.arange(len(samples)), "right") - 1, judged)
-    usable &= ~_unsettled(ticks["phase"], knees)
+    usable &= ~_unsettled(ticks["phase"], detector)
     return binned(ticks["phase"], usable, starts)
 
 
-def _unsettled(phase: Phases, knees: Knees) -> npt.NDArray[np.bool_]:
+def _unsettled(phase: Phases, detector: DetectorSettings) -> npt.NDArray[np.bool_]:
     """Rows after a breakpoint that is too close to the end of suction to be precise.
 
     Rows of the blow-off or idle after them count as well: its initial pressure is unknown.
@@ -736,7 +747,7 @@ def _unsettled(phase: Phases, knees: Knees) -> npt.NDArray[np.bool_]:
     kind = phase[begins]
     before = np.concatenate([[255], kind[:-1]])
     sucks, sucked = (np.isin(phases, [Phase.SUCTION, Phase.HOLD]) for phases in (kind, before))
-    after_knee = lengths - np.where(kind == Phase.SUCTION, knees.on_shift, knees.off_shift)
-    soon = sucks & sucked & (after_knee < knees.settles)
+    after_break = lengths - np.where(kind == Phase.SUCTION, detector.on_shift, detector.off_shift)
+    soon = sucks & sucked & (after_break < detector.settles)
     soon[1:] |= soon[:-1] & ~sucks[1:]
     return np.repeat(soon, lengths)

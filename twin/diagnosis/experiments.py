@@ -169,7 +169,7 @@ def _separation(
     """Sigmas by which a test would separate the found causes from their nearest rival."""
     theta = evidence.theta.copy()
     test.change(theta)
-    base = replace(evidence, theta=theta, uncertain=(), _seen={})
+    base = replace(evidence, theta=theta, uncertain=(), _detected_switchings={})
     recorded = of_log(base, [_simulated(theta, hypothesis, test.program)])
     if len(recorded.judged) < 2:
         return 0.0

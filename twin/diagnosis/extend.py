@@ -199,8 +199,11 @@ def _healthy(diagnosis: Diagnosis, data: DataSet) -> Healthy:
         name: _widened(scatter, wider.get(name.rsplit("_", 1)[0], 0.0))
         for name, scatter in evidence.healthy.figures.items()
     }
-    before, after = evidence.seen(evidence.theta), evidence.seen(coefficients(data))
-    doubted = [evidence.seen(evidence.course(doubt)[0][1]) for doubt in doubts]
+    before, after = (
+        evidence.detected_switching(evidence.theta),
+        evidence.detected_switching(coefficients(data)),
+    )
+    doubted = [evidence.detected_switching(evidence.course(doubt)[0][1]) for doubt in doubts]
     for name, end in (("h1_level", "off"), ("h1_low_level", "on")):
         if name in by_name:
             scatter = by_name.pop(name)

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.hypotheses import bounds, price, sized, sizes
-from twin.diagnosis.residual_covariance import Weights, levels
+from twin.diagnosis.residual_covariance import ResidualWhitener, levels
 from twin.inference.gauss_newton import Descent, descend, information
 from twin.inference.levels import CHI2_95
 from twin.inference.profile import profile_interval
@@ -63,14 +63,16 @@ class _Trial(Descent):
         )
 
 
-def white(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
+def white(
+    evidence: Evidence, weights: ResidualWhitener, hypotheses: Sequence[Hypothesis]
+) -> Floats:
     """Whitened residuals of hypotheses, (residuals, hypotheses)."""
     return weights.white(evidence.off(hypotheses), levels(evidence, weights.cycles, hypotheses))
 
 
 def fit(
     evidence: Evidence,
-    weights: Weights,
+    weights: ResidualWhitener,
     hypotheses: Sequence[Hypothesis],
     *,
     best_only: bool = False,
@@ -91,7 +93,9 @@ def fit(
     return [_fitted(evidence, trial) for trial in trials]
 
 
-def profiled(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]) -> Floats:
+def profiled(
+    evidence: Evidence, weights: ResidualWhitener, hypotheses: Sequence[Hypothesis]
+) -> Floats:
     """Chi-square of hypotheses after one Gauss-Newton step of their sizes, linearised."""
     hypotheses_at, moves = list[Hypothesis](), list[Floats]()
     for hypothesis in hypotheses:
@@ -110,7 +114,9 @@ def profiled(evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothes
     return np.array(misfits)
 
 
-def interval(evidence: Evidence, weights: Weights, fitted: Fitted) -> tuple[Floats, Floats]:
+def interval(
+    evidence: Evidence, weights: ResidualWhitener, fitted: Fitted
+) -> tuple[Floats, Floats]:
     """95 % profile-likelihood interval of each size, low and high.
 
     Residuals larger than noise widen it.

@@ -9,10 +9,10 @@ from twin.diagnosis.evidence import HEALTHY, Evidence
 from twin.diagnosis.residual_covariance import (
     MEETS,
     Covariance,
-    Weights,
+    ResidualWhitener,
     moved,
-    opened_by_calibration,
     scatter,
+    split_sensitivity,
 )
 from twin.model.term import KINDS
 from twin.monitor.bins import Bools, Floats, Ints, unwarped
@@ -36,7 +36,7 @@ class _HealthyDeviation:
     evidence: Evidence
     off: Floats
     moves: Floats  # by the usual size of each scatter
-    left_open: Floats  # by each uncertainty of the data set, as healthy cycles show it
+    parameter_sensitivity: Floats  # by each uncertainty of the data set, as healthy cycles show it
     beyond: Floats  # and what they do not show
 
     def by(self, healthy: Healthy) -> Covariance:
@@ -50,7 +50,7 @@ class _HealthyDeviation:
         no_other_day = np.empty((len(self.off), 0))  # healthy cycles are of the calibration's
         nothing = np.zeros_like(self.off)  # neither causes nor the day explain anything
         return Covariance(
-            evidence, nothing, moves, self.left_open, self.beyond, no_other_day, nothing
+            evidence, nothing, moves, self.parameter_sensitivity, self.beyond, no_other_day, nothing
         )
 
 
@@ -60,7 +60,7 @@ def learned(evidence: Evidence) -> Healthy:
     evidence = replace(evidence, another_day=False, healthy=unlearned)
     uncertain = [(shift.up, shift.down) for shift in evidence.uncertain]
     off, moves, opened = moved(evidence, HEALTHY, SCATTER, uncertain)
-    deviation = _HealthyDeviation(evidence, off, moves, *opened_by_calibration(evidence, opened))
+    deviation = _HealthyDeviation(evidence, off, moves, *split_sensitivity(evidence, opened))
     judged = evidence.judged
     halves = [(judged[::2], judged[1::2]), (judged[1::2], judged[::2])]
     if len(judged) < FEWEST:
@@ -81,7 +81,7 @@ def _chi2_by_cycle(deviation: _HealthyDeviation, healthy: Healthy, cycles: Seque
     return left_in_each(deviation.evidence, weights, white)
 
 
-def left_in_each(evidence: Evidence, weights: Weights, white: Floats) -> Floats:
+def left_in_each(evidence: Evidence, weights: ResidualWhitener, white: Floats) -> Floats:
     """Chi-square per residual in each cycle of ``weights``, from whitened residuals.
 
     ``white`` has bins, or bins and then levels.

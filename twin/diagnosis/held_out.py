@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 
 from twin.diagnosis.evidence import Evidence, Hypothesis
 from twin.diagnosis.healthy import left_in_each, usual_leftover
-from twin.diagnosis.residual_covariance import Weights, levels
+from twin.diagnosis.residual_covariance import ResidualWhitener, levels
 from twin.inference.levels import UPPER_95
 from twin.model import theta as c
 from twin.monitor.bins import Floats, Ints
@@ -44,7 +44,7 @@ class Judged:
         return usual_leftover(self.chi2)
 
 
-def judge(evidence: Evidence, weights: Weights, hypothesis: Hypothesis) -> Judged:
+def judge(evidence: Evidence, weights: ResidualWhitener, hypothesis: Hypothesis) -> Judged:
     """Deviation, errors of evacuation times and whitened rms on the cycles of ``weights``."""
     expected = evidence.expected(hypothesis)
     off = evidence.bins.mean(evidence.samples["pressure"] - expected) / MBAR

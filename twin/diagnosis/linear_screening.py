@@ -12,7 +12,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.hypotheses import price, sized
-from twin.diagnosis.residual_covariance import Weights, levels
+from twin.diagnosis.residual_covariance import ResidualWhitener, levels
 from twin.inference.sensitivities import derivatives
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
@@ -48,7 +48,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Promise:
+class ScreenedCandidate:
     """A hypothesis with its gain in chi-square by the linear model, less its penalty."""
 
     hypothesis: Hypothesis
@@ -108,7 +108,7 @@ def signatures(
     return Signatures(names, healthy, off, usual, level)
 
 
-def columns(evidence: Evidence, weights: Weights, moved: Signatures) -> Columns:
+def columns(evidence: Evidence, weights: ResidualWhitener, moved: Signatures) -> Columns:
     """Whitened signatures, cycle by cycle."""
     names, off, level = moved.names, moved.off, moved.level
     base = weights.white(moved.healthy[:, None], moved.usual[:, None])[:, 0]
@@ -129,7 +129,9 @@ def _sign(evidence: Evidence, p: Parameter) -> float:
     return float(p.high > neutral) - float(p.low < neutral)
 
 
-def promises(evidence: Evidence, weights: Weights, linear: Columns, each: int) -> list[Promise]:
+def linear_gains(
+    evidence: Evidence, weights: ResidualWhitener, linear: Columns, each: int
+) -> list[ScreenedCandidate]:
     """The best courses (``each`` of them) of every parameter, the largest gain first."""
     best: dict[tuple[str, str], dict[Course, _Gain]] = {}
     shares = list(_shares(evidence, weights))
@@ -144,16 +146,19 @@ def promises(evidence: Evidence, weights: Weights, linear: Columns, each: int) -
         sorted(by_course.values(), key=lambda gain: -gain.gain)[:each]
         for by_course in best.values()
     )
-    return sorted((_promised(evidence, linear, gain) for gain in chosen), key=_loss)
+    return sorted((_screened(evidence, linear, gain) for gain in chosen), key=_loss)
 
 
-def _loss(promise: Promise) -> float:
-    return -promise.gain
+def _loss(candidate: ScreenedCandidate) -> float:
+    return -candidate.gain
 
 
 def pairs(
-    evidence: Evidence, weights: Weights, linear: Columns, singles: Sequence[Promise]
-) -> list[Promise]:
+    evidence: Evidence,
+    weights: ResidualWhitener,
+    linear: Columns,
+    singles: Sequence[ScreenedCandidate],
+) -> list[ScreenedCandidate]:
     """Pairs of promises with both sizes fitted, the largest gain first."""
     options = [
         _Option(single.number, cause, share_of_cycles(evidence, weights, cause))
@@ -181,7 +186,7 @@ def pairs(
                 for option, times in zip((first, second), sizes, strict=True)
             )
             result.append(
-                Promise(
+                ScreenedCandidate(
                     hypothesis, float(gradient[list(pair)] @ sizes) - price(evidence, hypothesis)
                 )
             )
@@ -198,13 +203,15 @@ def _gain(evidence: Evidence, linear: Columns, option: _Option) -> _Gain:
     return _Gain(size * gradient - price(evidence, (option.cause,)), size, option)
 
 
-def _promised(evidence: Evidence, linear: Columns, gain: _Gain) -> Promise:
+def _screened(evidence: Evidence, linear: Columns, gain: _Gain) -> ScreenedCandidate:
     p = linear.names[gain.option.number][1]
     hypothesis = (_with_size(evidence, gain.option.cause, p, gain.size),)
-    return Promise(hypothesis, gain.gain, gain.option.number)
+    return ScreenedCandidate(hypothesis, gain.gain, gain.option.number)
 
 
-def _shares(evidence: Evidence, weights: Weights) -> Iterator[tuple[Course, float, Floats]]:
+def _shares(
+    evidence: Evidence, weights: ResidualWhitener
+) -> Iterator[tuple[Course, float, Floats]]:
     """Course, onset and weights of cycles, for all courses except intermittent ones."""
     courses = [(Course.CONSTANT, 0.0), (Course.RAMP, 0.0)]
     for onset in evidence.seconds[evidence.starts[np.array(weights.cycles)[1:]]]:
@@ -215,7 +222,7 @@ def _shares(evidence: Evidence, weights: Weights) -> Iterator[tuple[Course, floa
 
 def _options(
     evidence: Evidence,
-    weights: Weights,
+    weights: ResidualWhitener,
     linear: Columns,
     number: int,
     shares: Iterable[tuple[Course, float, Floats]],
@@ -251,7 +258,7 @@ def _striking(linear: Columns, number: int) -> Iterator[Ints]:
                 yield chosen
 
 
-def share_of_cycles(evidence: Evidence, weights: Weights, cause: Cause) -> Floats:
+def share_of_cycles(evidence: Evidence, weights: ResidualWhitener, cause: Cause) -> Floats:
     """Share of a cause's size in each cycle; a ramp's size is that at the end of the log."""
     cycles = np.array(weights.cycles)
     begins = evidence.seconds[evidence.starts[cycles]]

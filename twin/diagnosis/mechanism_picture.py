@@ -33,7 +33,7 @@ SUREST = 0.7  # of the size: one sigma of a dot that still says something
 
 
 @dataclass(frozen=True)
-class Seen:
+class DetectedSwitching:
     """A size over its driver, by law and as held-out cycles show it, in the size's unit."""
 
     parameter: str
@@ -64,7 +64,7 @@ class Inferred:
     x: Floats  # of each bin; NaN where the mechanism is not driven
     share: Floats
     levels: tuple[float, float] | None  # mbar, where it begins and ends, of a relay
-    sizes: tuple[Seen, ...]
+    sizes: tuple[DetectedSwitching, ...]
 
     @property
     def agreeing(self) -> tuple[int, int]:
@@ -104,7 +104,7 @@ def inferred(diagnosed: Found) -> Inferred:
         y = in_law * value + more
         names = parameter.name, parameter.unit, word
         arrays = (part[shown] for part in (middle, in_law, y, sigma))
-        sizes.append(Seen(*names, value, low, high, *arrays))
+        sizes.append(DetectedSwitching(*names, value, low, high, *arrays))
     begins = cause.values.get("begins", 0.0)
     relay = (begins, begins - cause.values["ends_below"]) if is_relay else None
     return Inferred(mechanism, label, x, share, relay, tuple(sizes))

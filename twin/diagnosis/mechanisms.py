@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
-from twin.diagnosis.residual_covariance import Weights, covariance
+from twin.diagnosis.residual_covariance import ResidualWhitener, covariance
 from twin.inference.levels import CHI2_999
 from twin.model import theta as c
 from twin.model.catalogue import has_room
@@ -173,7 +173,7 @@ def _best(
 
 
 def _fit_with_leaps(
-    evidence: Evidence, weights: Weights, hypotheses: Sequence[Hypothesis]
+    evidence: Evidence, weights: ResidualWhitener, hypotheses: Sequence[Hypothesis]
 ) -> list[Fitted]:
     """Fit hypotheses that end with a mechanism; refit from leaps of its levels while that helps."""
     finished, improving = list[Fitted](), fit(evidence, weights, hypotheses)
@@ -196,7 +196,7 @@ def _fit_with_leaps(
 
 
 def _farther_off(
-    evidence: Evidence, weights: Weights, fits: Sequence[Fitted]
+    evidence: Evidence, weights: ResidualWhitener, fits: Sequence[Fitted]
 ) -> list[Hypothesis | None]:
     """The best leap from each fit; None if no leap improves on the fit."""
     leaps = [list(_leaps(evidence, candidate.hypothesis)) for candidate in fits]
@@ -224,7 +224,9 @@ def _ranked(fits: Sequence[Fitted]) -> list[Fitted]:
     return sorted(fits, key=lambda candidate: candidate.score)
 
 
-def _promising(evidence: Evidence, weights: Weights, causes: Hypothesis) -> list[Hypothesis]:
+def _promising(
+    evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis
+) -> list[Hypothesis]:
     """One start, with sizes, for each of the FITTED mechanisms with the lowest misfit."""
     residuals = white(evidence, weights, [causes])[:, 0]
     starts = [
@@ -273,7 +275,7 @@ class _Start:
 
 def _linear(
     evidence: Evidence,
-    weights: Weights,
+    weights: ResidualWhitener,
     residuals: Floats,
     causes: Hypothesis,
     starts: Sequence[_Start],
@@ -308,7 +310,7 @@ def _linear(
     return np.array(gains), sizes
 
 
-def _differs(evidence: Evidence, weights: Weights, causes: Hypothesis) -> float:
+def _differs(evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis) -> float:
     """Share of the squared deviation (mbar) that is not the same in each cycle, 0 to 1."""
     off, count = evidence.off([causes])[weights.bins, 0], evidence.bins.count[weights.bins]
     _, place = np.unique(evidence.bins.place[weights.bins], return_inverse=True)
@@ -318,7 +320,7 @@ def _differs(evidence: Evidence, weights: Weights, causes: Hypothesis) -> float:
 
 def _rhythms(
     evidence: Evidence,
-    weights: Weights,
+    weights: ResidualWhitener,
     residuals: Floats,
     causes: Hypothesis,
     mechanism: Mechanism,
@@ -372,7 +374,7 @@ def _explained(
 
 
 def _not_told_from(
-    evidence: Evidence, weights: Weights, ranked: Sequence[Fitted]
+    evidence: Evidence, weights: ResidualWhitener, ranked: Sequence[Fitted]
 ) -> Iterator[Fitted]:
     """Fits that are about as likely as the best one, or nearly equal to it in mbar.
 
@@ -390,7 +392,7 @@ def _not_told_from(
 
 
 def _left_in_mbar(
-    evidence: Evidence, weights: Weights, causes: Hypothesis, hypothesis: Hypothesis
+    evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis, hypothesis: Hypothesis
 ) -> float:
     """Mean square deviation of a hypothesis over that of causes, both less that of healthy cycles.
 
@@ -405,7 +407,7 @@ def _left_in_mbar(
 
 
 def _squares(
-    evidence: Evidence, weights: Weights, causes: Hypothesis, hypothesis: Hypothesis
+    evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis, hypothesis: Hypothesis
 ) -> tuple[float, float]:
     """Mean square deviation (mbar²) of two hypotheses."""
     deviations = evidence.off([causes, hypothesis])[weights.bins]

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.diagnosis.evidence import Evidence, Hypothesis, LogCycles, thinned
 from twin.diagnosis.fit import Fitted, profiled, white
-from twin.diagnosis.residual_covariance import Weights, covariance
+from twin.diagnosis.residual_covariance import ResidualWhitener, covariance
 from twin.inference.levels import CHI2_95
 from twin.model.courses import Cause, Course
 from twin.monitor.bins import Floats
@@ -22,7 +22,7 @@ FARTHEST_S = 4.0  # largest distance of an onset's interval from it
 
 
 def with_times(
-    evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
+    evidence: Evidence, judged: ResidualWhitener, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
     """Hypotheses; the first few have their onset within a cycle, or their cycles, fitted."""
     result, timed = [], 0
@@ -36,13 +36,15 @@ def with_times(
     return result
 
 
-def _with_onset(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+def _with_onset(evidence: Evidence, judged: ResidualWhitener, hypothesis: Hypothesis) -> Hypothesis:
     """A hypothesis with the best onset of its last cause, within a cycle of the present one."""
     *others, cause = hypothesis
     return (*others, _with_best_onset(evidence, judged, tuple(others), cause, ONSETS, ONSET_S))
 
 
-def _with_cycles(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+def _with_cycles(
+    evidence: Evidence, judged: ResidualWhitener, hypothesis: Hypothesis
+) -> Hypothesis:
     """A hypothesis with the best cycles of its last cause: each is tried in and out.
 
     Unjudged cycles are tried as well: a cause in them affects the gas of the next cycle.
@@ -89,7 +91,9 @@ def _union(cycles: Iterable[frozenset[int]]) -> frozenset[int]:
 _PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
 
 
-def with_fine_onsets(evidence: Evidence, judged: Weights, hypothesis: Hypothesis) -> Hypothesis:
+def with_fine_onsets(
+    evidence: Evidence, judged: ResidualWhitener, hypothesis: Hypothesis
+) -> Hypothesis:
     """A hypothesis with the onset of every step searched to the row, with known sizes."""
     for number, cause in enumerate(hypothesis):
         if cause.course == Course.STEP:
@@ -100,7 +104,12 @@ def with_fine_onsets(evidence: Evidence, judged: Weights, hypothesis: Hypothesis
 
 
 def _with_best_onset(
-    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, count: int, fine: float
+    evidence: Evidence,
+    judged: ResidualWhitener,
+    others: Hypothesis,
+    cause: Cause,
+    count: int,
+    fine: float,
 ) -> Cause:
     """A cause with its best onset, within a cycle of the present one; ``count`` in round one."""
     cycle = float(np.median(np.diff(evidence.seconds[evidence.starts[:-1]])))
@@ -141,7 +150,7 @@ def sharp_onset(
 
 
 def _misfits(
-    evidence: Evidence, judged: Weights, others: Hypothesis, cause: Cause, onsets: Floats
+    evidence: Evidence, judged: ResidualWhitener, others: Hypothesis, cause: Cause, onsets: Floats
 ) -> Floats:
     tried = [(*others, replace(cause, onset_s=float(onset))) for onset in onsets]
     chi2: Floats = np.sum(white(evidence, judged, tried) ** 2, axis=0)
@@ -149,7 +158,11 @@ def _misfits(
 
 
 def onset_interval(
-    evidence: Evidence, judged: Weights, hypothesis: Hypothesis, number: int, leftover: float
+    evidence: Evidence,
+    judged: ResidualWhitener,
+    hypothesis: Hypothesis,
+    number: int,
+    leftover: float,
 ) -> tuple[float, float]:
     """95 % profile-likelihood interval (s) of a step's onset.
 

@@ -41,11 +41,11 @@ _OPENS = {name: p.touches[0] for name, p in SCATTERING.items() if p.is_time}
 _CLOSES = (c.RESPONSE_OFF, c.BLOW_OFF_RESPONSE_OFF)
 ROW = math.sqrt(3.0)  # half a row over the sigma of a time that is uniform within a row
 CLOSING_MS = 0.5  # one sigma of the time at which a valve closes
-KNEE_WINDOWS = 10  # the detector's window over the sigma of a breakpoint's time
+BREAK_WINDOWS = 10  # the detector's window over the sigma of a breakpoint's time
 # Columns of ``moved``: breakpoints are independent within a cycle; one column is for contact.
 _TIMES = len(_OPENS) + len(_CLOSES) + 2
-KNEES = [len(SCATTERING) + len(_CLOSES) + _TIMES * order for order in (0, 1)]
-MEETS = KNEES[0] + 1
+BREAK_COLUMNS = [len(SCATTERING) + len(_CLOSES) + _TIMES * order for order in (0, 1)]
+MEETS = BREAK_COLUMNS[0] + 1
 # Sigmas in a bin: largest uncertainty of the data set that healthy cycles can hide. The
 # uncertainty by another weather never shows in them.
 UNSEEN = 3.0
@@ -54,7 +54,7 @@ LEVEL_MBAR = 0.5  # sigma of a switching level, common to all cycles
 
 
 @dataclass(frozen=True)
-class Weights:
+class ResidualWhitener:
     """Whitens the residuals of some cycles to independent values with sigma 1."""
 
     cycles: tuple[int, ...]  # positions of the cycles
@@ -83,13 +83,14 @@ class Covariance:
     evidence: Evidence
     mismatch: Floats  # by one sigma of the error of the explained deviation, in each bin
     moves: Floats  # by one sigma of each scattering quantity, (bins, quantities)
-    left_open: Floats  # by one sigma of each data-set uncertainty, as far as healthy cycles show it
+    # By one sigma of each data-set uncertainty, as far as healthy cycles show it.
+    parameter_sensitivity: Floats
     beyond: Floats  # the rest of these responses: first order, then second order
     another_day: Floats  # by one sigma of each uncertainty of the log's day
     day_mismatch: Floats  # by one sigma of the error of the deviation that the day explains
     of_weather: bool = False  # whether the log's day has another weather
 
-    def of(self, cycles: Sequence[int], *, scattered: bool = True) -> Weights:
+    def of(self, cycles: Sequence[int], *, scattered: bool = True) -> ResidualWhitener:
         """Weights of some cycles; with ``scattered`` False, effects do not scatter."""
         evidence, bins = self.evidence, self.evidence.bins
         rows = np.flatnonzero(np.isin(bins.cycle, cycles))
@@ -98,7 +99,9 @@ class Covariance:
         # The factor holds for uncertainty that healthy cycles show, not for new causes in a log.
         learned = evidence.healthy.leftover
         unsure = np.hstack([self.beyond[rows], self.another_day[rows]])
-        unsure[:, : self.left_open.shape[1]] += learned * self.left_open[rows]
+        unsure[:, : self.parameter_sensitivity.shape[1]] += (
+            learned * self.parameter_sensitivity[rows]
+        )
         mismatches = [self.mismatch[rows], self.day_mismatch[rows]]
 
         def by_cycle(leftover: float) -> list[Floats]:
@@ -124,15 +127,15 @@ class Covariance:
             moves = np.concatenate([moves, np.zeros((len(sigma), moves.shape[1]))])
         shown = np.array([cycle for cycle, _ in _shown(evidence, cycles)], np.int64)
         factored = parts.CoupledCovariance.of(groups, moves, prior)
-        return Weights(tuple(cycles), rows, factored, usual, unmeasured, sigma, shown)
+        return ResidualWhitener(tuple(cycles), rows, factored, usual, unmeasured, sigma, shown)
 
     def _of_cycle(self, rows: Ints, alone: Floats, scatter: Floats, leftover: float) -> Floats:
         """Covariance (mbar²) between bins of a cycle by differences from cycle to cycle."""
         bins, healthy = self.evidence.bins, self.evidence.healthy
         reading = Reading(self.evidence.noise, healthy.rounding_mbar)
-        knees = parts.low_rank(scatter[:, KNEES], bins.stretch[rows])
-        moves = np.delete(scatter, KNEES, axis=1)
-        persistent = lasting(bins, rows, alone) + knees
+        breakpoints = parts.low_rank(scatter[:, BREAK_COLUMNS], bins.stretch[rows])
+        moves = np.delete(scatter, BREAK_COLUMNS, axis=1)
+        persistent = lasting(bins, rows, alone) + breakpoints
         return from_cycle_to_cycle(bins, rows, persistent, moves, reading, leftover)
 
 
@@ -181,14 +184,16 @@ def covariance(
         evidence, about, scatter(evidence), [*uncertain, *days], both_ways=both_ways
     )
     is_day = np.tile(np.arange(len(uncertain) + len(days)) >= len(uncertain), 1 + both_ways)
-    left_open, beyond = opened_by_calibration(evidence, opened[:, ~is_day], both_ways=both_ways)
+    parameter_sensitivity, beyond = split_sensitivity(
+        evidence, opened[:, ~is_day], both_ways=both_ways
+    )
     (healthy,) = evidence.off([HEALTHY]).T
     of_weather = any(cause.effect == WEATHER for cause in about)
     exact = Covariance(
         evidence,
         mismatch=MISMATCH * np.abs(healthy - off),
         moves=moves,
-        left_open=left_open,
+        parameter_sensitivity=parameter_sensitivity,
         beyond=beyond,
         another_day=opened[:, is_day],
         day_mismatch=np.zeros_like(off),
@@ -197,7 +202,7 @@ def covariance(
     return replace(exact, day_mismatch=MISMATCH * explained_by_day(exact, off))
 
 
-def opened_by_calibration(
+def split_sensitivity(
     evidence: Evidence, opened: Floats, *, both_ways: bool = True
 ) -> tuple[Floats, Floats]:
     """Responses to the data set's uncertainties: the part that healthy cycles show, and the rest.
@@ -208,7 +213,7 @@ def opened_by_calibration(
     is subtracted.
     """
     tied = np.array([shift.tied for shift in evidence.uncertain], bool)
-    nearby, up, down = evidence.left_open
+    nearby, up, down = evidence.parameter_sensitivity
     healthy = np.hstack(central(up, down) if both_ways else (up,))
     return nearby * tied, opened - healthy * np.tile(tied, 1 + both_ways)
 
@@ -259,22 +264,26 @@ def moved(
     delays = [(_OPENS[name], size) for name, (_, size) in sizes.items() if name in _OPENS]
     closing = max(CLOSING_MS, evidence.least_time_ms)
     times = [*delays, *((closes, closing) for closes in _CLOSES)]
-    knee = len(times)
+    break_column = len(times)
     if comes_on_part(evidence.theta):
         times.append((c.CONTACT, evidence.healthy.meets_ms))
     steps = [max(sigma, ROW * evidence.least_time_ms) for _, sigma in times]
     shares = np.insert(
-        [sigma / step for (_, sigma), step in zip(times, steps, strict=True)], knee, 1
+        [sigma / step for (_, sigma), step in zip(times, steps, strict=True)], break_column, 1
     )
     steady = steady[: len(steady) - len(delays)]
-    knee_shift = max(round(evidence.knees.window / KNEE_WINDOWS), 1)
+    break_shift = max(round(evidence.detector.window / BREAK_WINDOWS), 1)
     variants = []
     for sign in (1, -1):
         of_times = [
             (_at_another_time(evidence.theta, coefficient, sign * step), 0)
             for (coefficient, _), step in zip(times, steps, strict=True)
         ]
-        variants += [*of_times[:knee], (evidence.theta, sign * knee_shift), *of_times[knee:]]
+        variants += [
+            *of_times[:break_column],
+            (evidence.theta, sign * break_shift),
+            *of_times[break_column:],
+        ]
     variants += [(up, 0) for up, _ in uncertain]
     variants += [(down, 0) for _, down in uncertain if both_ways]
     unchanged_count = len(steady) + 1
@@ -289,8 +298,8 @@ def moved(
     first, second = central(sooner, later)
     never = np.zeros((len(deviation), _TIMES - len(shares)))
     moves = np.hstack([linear, first * shares, never, second * shares**2, never])
-    left_open = central(up, down) if both_ways else (up,)
-    return deviation, moves, np.hstack(left_open)
+    parameter_sensitivity = central(up, down) if both_ways else (up,)
+    return deviation, moves, np.hstack(parameter_sensitivity)
 
 
 def _at_another_time(theta: Theta, coefficient: int, later_ms: float) -> Theta:
@@ -318,7 +327,9 @@ def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
 def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypothesis]) -> Floats:
     """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses)."""
     shown = _shown(evidence, cycles)
-    at = np.array([evidence.knee(cycle, _INTO[number]) for cycle, number in shown], np.int64)
+    at = np.array(
+        [evidence.switching_row(cycle, _INTO[number]) for cycle, number in shown], np.int64
+    )
     nodes = [_nodes(evidence, at, hypothesis) for hypothesis in hypotheses]
     thetas = [
         [_coefficients_at(course, row) for row in rows]
@@ -329,7 +340,9 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
     relative = np.array([_relative_level(evidence, *level) for level in shown])
     deviations = np.empty((len(shown), len(hypotheses)))
     for i, (rows, thetas_of_hypothesis) in enumerate(zip(nodes, thetas, strict=True)):
-        seen = np.array([evidence.seen(theta).levels for theta in thetas_of_hypothesis])
+        seen = np.array(
+            [evidence.detected_switching(theta).levels for theta in thetas_of_hypothesis]
+        )
         for level_number in np.unique(number):
             of_level = number == level_number
             deviations[of_level, i] = relative[of_level] - np.interp(
@@ -376,7 +389,7 @@ def _relative_level(evidence: Evidence, cycle: int, number: int) -> float:
     healthy = evidence.healthy.figures.get(LEVELS[number])
     if healthy is None:
         return measured
-    return measured - (healthy.mean - evidence.seen(evidence.theta).levels[number])
+    return measured - (healthy.mean - evidence.detected_switching(evidence.theta).levels[number])
 
 
 def _level_sigmas(evidence: Evidence, cycles: Sequence[int]) -> Floats:

@@ -35,12 +35,12 @@ from twin.diagnosis.linear_screening import (
     Columns,
     Signatures,
     columns,
+    linear_gains,
     pairs,
-    promises,
     signatures,
 )
 from twin.diagnosis.onset import onset_interval, sharp_onset, with_fine_onsets, with_times
-from twin.diagnosis.residual_covariance import Covariance, Weights, covariance
+from twin.diagnosis.residual_covariance import Covariance, ResidualWhitener, covariance
 from twin.inference.levels import CHI2_95, CHI2_999, SIGMAS_95
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause, Course
@@ -143,8 +143,8 @@ class _Found:
 
     found: Fitted
     known: Covariance
-    judged: Weights  # of all judged cycles
-    weights: Weights  # of the fitted ones
+    judged: ResidualWhitener  # of all judged cycles
+    weights: ResidualWhitener  # of the fitted ones
     healthy: float  # chi-square without any cause
 
 
@@ -289,7 +289,9 @@ def stranger(rival: Fitted, found: Fitted) -> str:
     return next(effect for effect in rival.effects if effect not in found.effects)
 
 
-def _size_intervals(evidence: Evidence, weights: Weights, found: Fitted) -> tuple[Floats, Floats]:
+def _size_intervals(
+    evidence: Evidence, weights: ResidualWhitener, found: Fitted
+) -> tuple[Floats, Floats]:
     """95 % interval of each size, over all laws of a cause that the log cannot reject."""
     low, high = interval(evidence, weights, found)
     alternatives = [
@@ -306,12 +308,12 @@ def _size_intervals(evidence: Evidence, weights: Weights, found: Fitted) -> tupl
     return low, high
 
 
-def _healthy(evidence: Evidence, weights: Weights) -> float:
+def _healthy(evidence: Evidence, weights: ResidualWhitener) -> float:
     residual = white(evidence, weights, [HEALTHY])
     return float(np.sum(residual**2))
 
 
-def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> list[Fitted]:
+def _ranked(evidence: Evidence, judged: ResidualWhitener, found: Sequence[Fitted]) -> list[Fitted]:
     """The best course of each set of effects, the best first.
 
     All judged cycles choose the course, as the fitted ones do not show in which an effect acts.
@@ -331,17 +333,21 @@ def _ranked(evidence: Evidence, judged: Weights, found: Sequence[Fitted]) -> lis
 
 
 def _fit_singles(
-    evidence: Evidence, judged: Weights, weights: Weights, alone: Signatures, progress: Progress
+    evidence: Evidence,
+    judged: ResidualWhitener,
+    weights: ResidualWhitener,
+    alone: Signatures,
+    progress: Progress,
 ) -> list[Fitted]:
     """Fit every effect with its most promising courses."""
     linear = columns(evidence, judged, alone)
-    promised = promises(evidence, judged, linear, each=2)
-    first = {promise.hypothesis[0].effect: promise for promise in reversed(promised)}
+    screened = linear_gains(evidence, judged, linear, each=2)
+    first = {candidate.hypothesis[0].effect: candidate for candidate in reversed(screened)}
     hypotheses = [
-        promise.hypothesis
-        for promise in promised
-        if promise is first[promise.hypothesis[0].effect]
-        or promise.gain > SECOND * promised[0].gain
+        candidate.hypothesis
+        for candidate in screened
+        if candidate is first[candidate.hypothesis[0].effect]
+        or candidate.gain > SECOND * screened[0].gain
     ]
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
@@ -349,7 +355,10 @@ def _fit_singles(
     if min(candidate.leftover for candidate in tried) < GREAT:
         return tried
     progress("what acts is great: fitting each cause with every course")
-    more = [promise.hypothesis for promise in promises(evidence, judged, linear, each=len(Course))]
+    more = [
+        candidate.hypothesis
+        for candidate in linear_gains(evidence, judged, linear, each=len(Course))
+    ]
     started = _started(
         evidence, judged, [hypothesis for hypothesis in more if hypothesis not in hypotheses]
     )
@@ -436,7 +445,7 @@ def _weather(evidence: Evidence, ranked: Sequence[Fitted]) -> list[Fitted]:
 
 
 def _started(
-    evidence: Evidence, judged: Weights, hypotheses: Sequence[Hypothesis]
+    evidence: Evidence, judged: ResidualWhitener, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
     """Hypotheses with the last cause at the best of some sizes, by each law that it may act by.
 
@@ -471,10 +480,10 @@ def _best_addition(
     found, judged, weights = current.found, current.judged, current.weights
     hypothesis = found.hypothesis
     moved = signatures(evidence, judged.cycles, hypothesis)
-    promised = promises(evidence, judged, columns(evidence, judged, moved), each=2)
+    screened = linear_gains(evidence, judged, columns(evidence, judged, moved), each=2)
     new = [
         candidate
-        for candidate in promised
+        for candidate in screened
         if _can_join(evidence, candidate.hypothesis[0], hypothesis)
     ]
     new = [candidate for candidate in new[:TRIED_MORE] if candidate.gain > HOPEFUL]
@@ -498,17 +507,19 @@ def _can_join(evidence: Evidence, cause: Cause, others: Hypothesis) -> bool:
     return cause.effect not in names and has_room(evidence.theta, (*names, cause.effect))
 
 
-def _linear_pairs(evidence: Evidence, judged: Weights, alone: Columns) -> list[Hypothesis]:
+def _linear_pairs(evidence: Evidence, judged: ResidualWhitener, alone: Columns) -> list[Hypothesis]:
     """Pairs that explain more than any single cause in the linear model."""
-    singles = promises(evidence, judged, alone, each=2)
+    singles = linear_gains(evidence, judged, alone, each=2)
     best_pairs = pairs(evidence, judged, alone, singles)[:TRIED_PAIRS]
     return [
-        promise.hypothesis for promise in best_pairs if promise.gain > singles[0].gain + HOPEFUL
+        candidate.hypothesis
+        for candidate in best_pairs
+        if candidate.gain > singles[0].gain + HOPEFUL
     ]
 
 
 def _fitted_pairs(
-    evidence: Evidence, weights: Weights, singles: Sequence[Fitted], found: Fitted
+    evidence: Evidence, weights: ResidualWhitener, singles: Sequence[Fitted], found: Fitted
 ) -> list[Hypothesis]:
     """Pairs of single causes as they were fitted: delays are far from linear."""
     combined = [
@@ -564,7 +575,7 @@ def _sizes_of_causes(evidence: Evidence, fitted: Fitted) -> list[float]:
     return sizes
 
 
-def _pruned(evidence: Evidence, weights: Weights, found: Fitted, healthy: float) -> Fitted:
+def _pruned(evidence: Evidence, weights: ResidualWhitener, found: Fitted, healthy: float) -> Fitted:
     """``found`` without the causes that do not exceed their penalty beside the others."""
     while len(found.hypothesis) > 1:
         without = [
@@ -613,7 +624,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
 
 
 def held_out_gain(
-    evidence: Evidence, unseen: Weights, without: Hypothesis, hypothesis: Hypothesis
+    evidence: Evidence, unseen: ResidualWhitener, without: Hypothesis, hypothesis: Hypothesis
 ) -> tuple[float, float]:
     """95 % interval of the chi-square that a hypothesis gains over another on unseen cycles.
 
@@ -627,7 +638,9 @@ def held_out_gain(
     return gain - reach, gain + reach
 
 
-def _weather_gain(evidence: Evidence, unseen: Weights, weather: Hypothesis) -> tuple[float, float]:
+def _weather_gain(
+    evidence: Evidence, unseen: ResidualWhitener, weather: Hypothesis
+) -> tuple[float, float]:
     """``held_out_gain`` of weather, where the healthy twin has the weights about itself.
 
     By those about weather, which are wide, much of the deviation would count as left open without
@@ -697,7 +710,11 @@ def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
 
 
 def _rivals(
-    evidence: Evidence, judged: Weights, weights: Weights, found: Fitted, singles: list[Fitted]
+    evidence: Evidence,
+    judged: ResidualWhitener,
+    weights: ResidualWhitener,
+    found: Fitted,
+    singles: list[Fitted],
 ) -> list[list[Fitted]]:
     """For each cause: rivals that fit as well in its place, refitted with the others.
 
@@ -710,13 +727,13 @@ def _rivals(
         remaining = tuple(c for i, c in enumerate(found.hypothesis) if i != left_out)
         if remaining:
             linear = columns(evidence, judged, signatures(evidence, judged.cycles, remaining))
-            promised = promises(evidence, judged, linear, each=1)
+            screened = linear_gains(evidence, judged, linear, each=1)
             tried = [
                 (*remaining, *candidate.hypothesis)
-                for candidate in promised
+                for candidate in screened
                 if candidate.hypothesis[0].effect not in found.effects
                 and _can_join(evidence, candidate.hypothesis[0], remaining)
-                and candidate.gain > NEARLY * promised[0].gain
+                and candidate.gain > NEARLY * screened[0].gain
             ][:TRIED_PAIRS]
             timed = with_times(evidence, judged, tried)
             fitted = _ranked(evidence, judged, fit(evidence, weights, timed))

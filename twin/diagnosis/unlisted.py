@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
-from twin.diagnosis.residual_covariance import Covariance, Weights, levels
+from twin.diagnosis.residual_covariance import Covariance, ResidualWhitener, levels
 from twin.inference.unmodelled import hats, knots_over
 from twin.model import theta as c
 from twin.model.courses import Cause
@@ -59,7 +59,7 @@ class Unlisted:
 class _Residual:
     """Residual of a hypothesis on some cycles: bins in mbar, and whitened with the levels."""
 
-    weights: Weights
+    weights: ResidualWhitener
     off: Floats
     white: Floats
 

@@ -10,7 +10,7 @@ import numpy as np
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import white
 from twin.diagnosis.hypotheses import often
-from twin.diagnosis.residual_covariance import Weights
+from twin.diagnosis.residual_covariance import ResidualWhitener
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.inference.priors import tempered
 from twin.inference.unmodelled import MISMATCH, SHARES, SIZES, Odds, alone, log_likelihoods
@@ -23,7 +23,7 @@ class Unmodelled:
     """Likelihoods of an unlisted effect, given a hypothesis."""
 
     evidence: Evidence
-    weights: Weights  # about the hypothesis
+    weights: ResidualWhitener  # about the hypothesis
     found: Hypothesis
 
     @cached_property

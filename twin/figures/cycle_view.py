@@ -80,7 +80,7 @@ class Supply(NamedTuple):
     highest: float
 
 
-class Course(NamedTuple):
+class CycleFindings(NamedTuple):
     """Findings in the rows of a cycle; NaN where they do not tell."""
 
     ended: bool
@@ -102,9 +102,9 @@ class Course(NamedTuple):
         return self.ended and self.vacuum.even
 
 
-def course(rows: Rows, h2: float, h1: float) -> Course:
+def find_in_cycle(rows: Rows, h2: float, h1: float) -> CycleFindings:
     """The findings in the rows of a cycle, with the unit's levels (mbar)."""
-    result: Course = _course(
+    result: CycleFindings = _find_in_cycle(
         rows.time,
         rows.vacuum,
         rows.supply,
@@ -146,7 +146,7 @@ def _measured(
 
 
 @compiled
-def _course(
+def _find_in_cycle(
     time: Floats,
     vacuum: Floats,
     supply: Floats,
@@ -154,12 +154,12 @@ def _course(
     ends_seen: tuple[bool, bool],
     lags: tuple[float, float],
     levels: tuple[float, float],
-) -> Course:
+) -> CycleFindings:
     """The findings in rows; ``ends_seen``, ``lags`` and ``levels`` are pairs."""
     rows = _suction_rows(phase)
     suction_s = _at(time, rows)
     suction = phase[:rows]
-    return Course(
+    return CycleFindings(
         ends_seen[0],
         ends_seen[1],
         suction_s,

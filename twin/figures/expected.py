@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from twin.figures.cycle_view import Bytes, Floats, Rows, course
+from twin.figures.cycle_view import Bytes, Floats, Rows, find_in_cycle
 from twin.model import dense_solver, kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
@@ -147,7 +147,7 @@ def leakage_from_rest(data: DataSet) -> float:
     vacuum, phase = _suction(coefficients(data), LONGEST_SUCTION_S)
     time = np.arange(len(vacuum), dtype=np.float64) * MS
     rows = Rows(time, vacuum, np.full(len(time), np.nan), phase, ended=True, blown=False)
-    leakage = course(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
+    leakage = find_in_cycle(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
     return leakage if math.isfinite(leakage) else 0.0
 
 

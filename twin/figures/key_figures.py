@@ -9,7 +9,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from twin.figures.cycle_view import Course, Rows, course
+from twin.figures.cycle_view import CycleFindings, Rows, find_in_cycle
 from twin.model.dataset import DataSet
 from twin.signals import BAR, MBAR
 
@@ -40,7 +40,7 @@ class Unit:
         return self.data.ejector.h2_mbar
 
 
-Of = Callable[[Course, Unit], float]
+Of = Callable[[CycleFindings, Unit], float]
 
 
 @dataclass(frozen=True)
@@ -53,118 +53,118 @@ class Figure:
     of: Of
 
 
-def t0(course: Course, _unit: Unit) -> float:
+def t0(findings: CycleFindings, _unit: Unit) -> float:
     """Evacuation time to H2 (ms)."""
-    return course.vacuum.h2_s * 1e3
+    return findings.vacuum.h2_s * 1e3
 
 
-def t1(course: Course, _unit: Unit) -> float:
+def t1(findings: CycleFindings, _unit: Unit) -> float:
     """Evacuation time from H2 to H1 (ms), or to the air saving's switching if there is one."""
-    if not course.vacuum.seamless:
+    if not findings.vacuum.seamless:
         return UNKNOWN
-    h1 = course.nozzle.off_s if course.nozzle.went_off else course.vacuum.h1_s
-    passed = h1 - course.vacuum.h2_s
+    h1 = findings.nozzle.off_s if findings.nozzle.went_off else findings.vacuum.h1_s
+    passed = h1 - findings.vacuum.h2_s
     return passed * 1e3 if passed > 0.0 else UNKNOWN  # the sensor is too slow to tell
 
 
-def leakage(course: Course, _unit: Unit) -> float:
+def leakage(findings: CycleFindings, _unit: Unit) -> float:
     """Vacuum lost per time (mbar/s): slope of a line through the first stretch of hold."""
-    return course.vacuum.leakage
+    return findings.vacuum.leakage
 
 
-def leakage_band(course: Course, unit: Unit) -> float:
+def leakage_band(findings: CycleFindings, unit: Unit) -> float:
     """Band of the leakage, as the field has them: 0 is good, 3 is beyond the last."""
-    lost = leakage(course, unit)
+    lost = leakage(findings, unit)
     return UNKNOWN if math.isnan(lost) else float(bisect_right(BANDS, lost))
 
 
-def quality(course: Course, unit: Unit) -> float:
+def quality(findings: CycleFindings, unit: Unit) -> float:
     """Quality (%) from the leakage: 100 without any."""
-    return _percent(1.0 - leakage(course, unit) / WORST_LEAKAGE)
+    return _percent(1.0 - leakage(findings, unit) / WORST_LEAKAGE)
 
 
-def free_flow(course: Course, unit: Unit) -> float:
+def free_flow(findings: CycleFindings, unit: Unit) -> float:
     """Vacuum (mbar) at which suction settles below H1, as with the cup open."""
-    if not course.is_even or (course.is_whole and course.nozzle.went_off):
+    if not findings.is_even or (findings.is_whole and findings.nozzle.went_off):
         return UNKNOWN
-    if course.suction_s < FREE_SUCTION_S or abs(course.vacuum.last_slope) > STEADY:
+    if findings.suction_s < FREE_SUCTION_S or abs(findings.vacuum.last_slope) > STEADY:
         return UNKNOWN
-    free = course.vacuum.last >= LEAST_FREE_FLOW and course.vacuum.highest < unit.h1
-    return course.vacuum.last if free else UNKNOWN
+    free = findings.vacuum.last >= LEAST_FREE_FLOW and findings.vacuum.highest < unit.h1
+    return findings.vacuum.last if free else UNKNOWN
 
 
-def performance(course: Course, unit: Unit) -> float:
+def performance(findings: CycleFindings, unit: Unit) -> float:
     """Performance (%) from the free-flow vacuum: 100 without any restriction, 0 at H1."""
-    return _percent(1.0 - free_flow(course, unit) / unit.h1)
+    return _percent(1.0 - free_flow(findings, unit) / unit.h1)
 
 
-def max_vacuum(course: Course, _unit: Unit) -> float:
+def max_vacuum(findings: CycleFindings, _unit: Unit) -> float:
     """Highest vacuum (mbar)."""
-    return course.vacuum.highest if course.is_even else UNKNOWN
+    return findings.vacuum.highest if findings.is_even else UNKNOWN
 
 
-def h1_not_reached(course: Course, unit: Unit) -> float:
+def h1_not_reached(findings: CycleFindings, unit: Unit) -> float:
     """1 if suction ended before H1 was reached, else 0."""
-    if course.vacuum.seamless and course.nozzle.went_off:
+    if findings.vacuum.seamless and findings.nozzle.went_off:
         return 0.0
-    highest = max_vacuum(course, unit)
+    highest = max_vacuum(findings, unit)
     return UNKNOWN if math.isnan(highest) else float(highest < unit.h1)
 
 
-def nozzle_share(course: Course, _unit: Unit) -> float:
+def nozzle_share(findings: CycleFindings, _unit: Unit) -> float:
     """Share of the suction time in which the nozzle was on (%)."""
-    return 100.0 * _nozzle_s(course) / course.suction_s if course.suction_s else UNKNOWN
+    return 100.0 * _nozzle_s(findings) / findings.suction_s if findings.suction_s else UNKNOWN
 
 
-def air(course: Course, unit: Unit) -> float:
+def air(findings: CycleFindings, unit: Unit) -> float:
     """Compressed air (Nl) through nozzle and blow-off."""
-    if not course.blown:
+    if not findings.blown:
         return UNKNOWN
     ejector = unit.data.ejector
-    nominal = _nozzle_s(course) * ejector.air_consumption_sl_min
-    nominal += course.blow_off_s * ejector.blow_off_sl_min
-    return nominal * _pressed(course, unit) / 60.0
+    nominal = _nozzle_s(findings) * ejector.air_consumption_sl_min
+    nominal += findings.blow_off_s * ejector.blow_off_sl_min
+    return nominal * _pressed(findings, unit) / 60.0
 
 
-def energy(course: Course, unit: Unit) -> float:
+def energy(findings: CycleFindings, unit: Unit) -> float:
     """Electric energy (Wh) to compress that air."""
-    return air(course, unit) * unit.energy_kwh_m3
+    return air(findings, unit) * unit.energy_kwh_m3
 
 
-def switchings(course: Course, _unit: Unit) -> float:
+def switchings(findings: CycleFindings, _unit: Unit) -> float:
     """Number of times the nozzle was switched on."""
-    return float(course.nozzle.switchings) if course.is_whole else UNKNOWN
+    return float(findings.nozzle.switchings) if findings.is_whole else UNKNOWN
 
 
-def quick_switchings(course: Course, _unit: Unit) -> float:
+def quick_switchings(findings: CycleFindings, _unit: Unit) -> float:
     """Most switchings of the air saving, on or off, within the time of valve protection."""
-    return float(course.nozzle.quick_switchings) if course.is_whole else UNKNOWN
+    return float(findings.nozzle.quick_switchings) if findings.is_whole else UNKNOWN
 
 
-def supply(course: Course, _unit: Unit) -> float:
+def supply(findings: CycleFindings, _unit: Unit) -> float:
     """Mean operating pressure while the nozzle was on (bar)."""
-    return course.supply.mean
+    return findings.supply.mean
 
 
-def lowest_supply(course: Course, _unit: Unit) -> float:
+def lowest_supply(findings: CycleFindings, _unit: Unit) -> float:
     """Lowest operating pressure while the nozzle was on (bar)."""
-    return course.supply.lowest
+    return findings.supply.lowest
 
 
-def highest_supply(course: Course, _unit: Unit) -> float:
+def highest_supply(findings: CycleFindings, _unit: Unit) -> float:
     """Highest operating pressure while the nozzle was on (bar)."""
-    return course.supply.highest
+    return findings.supply.highest
 
 
-def _nozzle_s(course: Course) -> float:
+def _nozzle_s(findings: CycleFindings) -> float:
     """Time that the nozzle was on (s); unknown if a switching may have been missed."""
-    return course.nozzle.on_s if course.is_whole else UNKNOWN
+    return findings.nozzle.on_s if findings.is_whole else UNKNOWN
 
 
-def _pressed(course: Course, unit: Unit) -> float:
+def _pressed(findings: CycleFindings, unit: Unit) -> float:
     """Absolute operating pressure over that of the data set: a sonic nozzle's flow follows it."""
     ambient, nominal = unit.data.ambient.pressure_mbar * MBAR / BAR, unit.data.supply.nozzle_bar
-    measured_bar = supply(course, unit)
+    measured_bar = supply(findings, unit)
     return 1.0 if math.isnan(measured_bar) else (measured_bar + ambient) / (nominal + ambient)
 
 
@@ -225,8 +225,8 @@ FIGURES = {
 
 def figures(rows: Rows, unit: Unit) -> dict[str, float]:
     """All key figures of one side of a cycle; NaN if unknown."""
-    cycle_course = course(rows, unit.h2, unit.h1)
-    return {name: figure.of(cycle_course, unit) for name, figure in FIGURES.items()}
+    findings = find_in_cycle(rows, unit.h2, unit.h1)
+    return {name: figure.of(findings, unit) for name, figure in FIGURES.items()}
 
 
 def table() -> str:

@@ -34,7 +34,7 @@ class Alarms:
         return count
 
 
-class Keeper:
+class FigureWriter:
     """A sink that stores the key figures of CYCLE events, in a thread of its own.
 
     A failure to write is reported once, and cycles wait until writing works again; the loop goes on

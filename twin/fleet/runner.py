@@ -30,7 +30,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Told:
+class Outcome:
     """The outcome for a log."""
 
     log: Path
@@ -40,7 +40,7 @@ class Told:
     complete: bool = True  # the log, as far as it could be read
 
 
-def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wanted | Told]:
+def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wanted | Outcome]:
     """Open every log; yields its job, or why there is none."""
     for path in logs:
         try:
@@ -56,7 +56,7 @@ def ask(work: str, logs: Iterable[Path], configure: Configure) -> Iterator[Wante
 
 def go(
     wanted: Sequence[Wanted], submit: Submit, store: Store, assets: str | Path | URL
-) -> Iterator[Told]:
+) -> Iterator[Outcome]:
     """Run jobs; yields each outcome once it is stored."""
     store.note({item.key.log_sha256: item.complete for item in wanted})
     stored = store.known([item.key for item in wanted])
@@ -64,7 +64,7 @@ def go(
     seen = set(stored)
     for item in wanted:
         if item.key in seen:
-            yield Told(item.job.log, "known", item.key, complete=item.complete)
+            yield Outcome(item.job.log, "known", item.key, complete=item.complete)
         else:
             seen.add(item.key)
             futures[submit(run, item.job)] = item
@@ -74,7 +74,7 @@ def go(
 
 def _store_outcome(
     future: Future[Done], item: Wanted, store: Store, assets: str | Path | URL
-) -> Told:
+) -> Outcome:
     log = item.job.log
     try:
         outcome = future.result()
@@ -88,12 +88,12 @@ def _store_outcome(
         with open_assets(assets) as database:
             add_calibrated(database, outcome.record)
     store.add(item.key, item.job.config, log, item.begin_ns, outcome.answer)
-    return Told(log, "done", item.key, complete=item.complete)
+    return Outcome(log, "done", item.key, complete=item.complete)
 
 
-def _failed(log: Path, reason: str) -> Told:
+def _failed(log: Path, reason: str) -> Outcome:
     """The outcome of a failed log; its text names the log."""
-    return Told(log, "failed", error=reason if str(log) in reason else f"{log}: {reason}")
+    return Outcome(log, "failed", error=reason if str(log) in reason else f"{log}: {reason}")
 
 
 def _begin_ns(log: Log) -> int:

@@ -30,7 +30,7 @@ def watched(config: Config, blocks: Iterable[Samples]) -> dict[str, Any]:
             if (cycle_figures := key_figures.take(cycle)) is not None:
                 figures_of_cycles.append(cycle_figures)
             if cycle.complete and cycle.settled:
-                residual = extractor.hear(cycle, *predictions, figures(cycle, extractor.theta))
+                residual = extractor.extract(cycle, *predictions, figures(cycle, extractor.theta))
                 residuals += [] if residual is None else [residual]
     return {
         "format": FORMAT,

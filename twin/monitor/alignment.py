@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from twin.monitor.breakpoints import OF_A_ROW, WANTED, Course, Floats, fits, turns, vertex
+from twin.monitor.breakpoints import OF_A_ROW, WANTED, Floats, PressureCurve, fits, turns, vertex
 from twin.signals import MS
 
 FEWEST = 3  # least number of breakpoints for a mean curve
@@ -40,7 +40,7 @@ OWN, ALIKE = (
 
 
 @dataclass
-class Knee:
+class Breakpoint:
     """A breakpoint: the nozzle's switching as it shows in the pressure."""
 
     on: bool
@@ -54,32 +54,34 @@ class Knee:
     held: float = np.nan  # Pa at the end of suction, if the nozzle is off until then
 
 
-def align_by_level(course: Course, knees: Sequence[Knee]) -> None:
-    """Move the ``knees`` of falls to where they pass a common pressure, if that fits better.
+def align_by_level(curve: PressureCurve, breakpoints: Sequence[Breakpoint]) -> None:
+    """Move the ``breakpoints`` of falls to where they pass a common pressure, if that fits better.
 
     It fits better if their curves are then much more similar. First and later falls of suctions
     are treated apart: each kind has its own curve and its own time from pressure to breakpoint.
     """
-    if len(knees) < FEWEST:
+    if len(breakpoints) < FEWEST:
         return
-    times = np.array([knee.time for knee in knees])
-    passes = np.array([_passes(course, knee, _passed_by_all(course, knees)) for knee in knees])
+    times = np.array([point.time for point in breakpoints])
+    passes = np.array(
+        [_passes(curve, point, _passed_by_all(curve, breakpoints)) for point in breakpoints]
+    )
     if not (np.abs(times - passes) < AROUND).all():  # the fall is too slow to time a pressure
         return
-    by_level = np.empty(len(knees))
+    by_level = np.empty(len(breakpoints))
     before = after = 0.0
-    for later in {knee.later for knee in knees}:
-        alike = [number for number, knee in enumerate(knees) if knee.later == later]
+    for later in {point.later for point in breakpoints}:
+        alike = [number for number, point in enumerate(breakpoints) if point.later == later]
         by_level[alike] = passes[alike] + np.median((times - passes)[alike])
-        alike_knees = [knees[number] for number in alike]
-        before += _difference(course, alike_knees, times[alike])
-        after += _difference(course, alike_knees, by_level[alike])
+        similar = [breakpoints[number] for number in alike]
+        before += _difference(curve, similar, times[alike])
+        after += _difference(curve, similar, by_level[alike])
     if after < MUCH_MORE_ALIKE * before:
-        for knee, time in zip(knees, by_level.tolist(), strict=True):
-            knee.time = time
+        for point, time in zip(breakpoints, by_level.tolist(), strict=True):
+            point.time = time
 
 
-def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
+def align_by_curve(curve: PressureCurve, breakpoints: Sequence[Breakpoint]) -> None:
     """Move each breakpoint to where its curve is most like the usual one, if much more so.
 
     A line that rings after the nozzle has closed breaks the slope repeatedly, so some breakpoints
@@ -88,119 +90,120 @@ def align_by_course(course: Course, knees: Sequence[Knee]) -> None:
     another than the compared time stay where they are. All stay if the rows are too far apart to
     show a ringing line.
     """
-    times = np.array([knee.time for knee in knees])
-    rows = np.array([knee.rows for knee in knees], np.int64).reshape(-1, 2)
-    limits = course.time[rows - [0, 1]]
+    times = np.array([point.time for point in breakpoints])
+    rows = np.array([point.rows for point in breakpoints], np.int64).reshape(-1, 2)
+    limits = curve.time[rows - [0, 1]]
     has_room = (times - AROUND > limits[:, 0]) & (times + AROUND < limits[:, 1])
-    is_fine = FINE_ROWS * course.period < 2.0 * AROUND
-    if not is_fine or np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(knees)):
+    is_fine = FINE_ROWS * curve.period < 2.0 * AROUND
+    if not is_fine or np.count_nonzero(has_room) < max(FEWEST, 0.5 * len(breakpoints)):
         return
-    usual = np.median(_bent(course, times[has_room]), axis=0)
-    shifts = np.arange(-FARTHEST, FARTHEST + 0.5 * course.period, course.period)
+    usual = np.median(_bent(curve, times[has_room]), axis=0)
+    shifts = np.arange(-FARTHEST, FARTHEST + 0.5 * curve.period, curve.period)
     for number in np.flatnonzero(has_room):
         first, last = limits[number]
         at = times[number] + shifts
         at = np.append(times[number], at[(at - AROUND > first) & (at + AROUND < last)])
-        squares = np.mean((_bent(course, at) - usual) ** 2, axis=1)
+        squares = np.mean((_bent(curve, at) - usual) ** 2, axis=1)
         best = int(squares.argmin())
-        is_off = squares[0] > (ELSEWHERE * course.noise.single) ** 2
+        is_off = squares[0] > (ELSEWHERE * curve.noise.single) ** 2
         if is_off and squares[best] < MUCH_MORE_ALIKE * squares[0]:
             times[number] = at[best]
-    times += _first_end_of_fall(course, times[has_room])
-    for knee, time in zip(knees, times.tolist(), strict=True):
-        knee.time = time
+    times += _first_end_of_fall(curve, times[has_room])
+    for point, time in zip(breakpoints, times.tolist(), strict=True):
+        point.time = time
 
 
-def _bent(course: Course, times: Floats) -> Floats:
+def _bent(curve: PressureCurve, times: Floats) -> Floats:
     """The curve (Pa) about times, each less its own straight line, (times, rows)."""
-    offsets = np.arange(-AROUND, AROUND, course.period)
+    offsets = np.arange(-AROUND, AROUND, curve.period)
     straight = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(offsets)), 2))[0]
-    values = np.interp(times[:, None] + offsets, course.time, course.pressure)
+    values = np.interp(times[:, None] + offsets, curve.time, curve.pressure)
     without_line: Floats = values - (values @ straight) @ straight.T
     return without_line
 
 
-def _first_end_of_fall(course: Course, times: Floats) -> float:
+def _first_end_of_fall(curve: PressureCurve, times: Floats) -> float:
     """Offset (s, not positive) from the breaks to the first end of the usual fall before them.
 
     0 if the pressure falls up to the break.
     """
-    offsets = np.arange(-AROUND, 0.5 * course.period, course.period)
-    falls = np.interp(times[:, None] + offsets, course.time, course.pressure)
-    rows = turns(np.median(falls, axis=0), CLEAR * course.noise.single)
+    offsets = np.arange(-AROUND, 0.5 * curve.period, curve.period)
+    falls = np.interp(times[:, None] + offsets, curve.time, curve.pressure)
+    rows = turns(np.median(falls, axis=0), CLEAR * curve.noise.single)
     return float(offsets[rows[0]]) if len(rows) > 1 else 0.0  # a low, and a high after it
 
 
-def _passed_by_all(course: Course, knees: Sequence[Knee]) -> float:
-    """The usual pressure (Pa) of ``knees``, or a higher one that all curves fall below."""
-    lowest = [course.pressure[slice(*knee.rows)].min() for knee in knees]
-    surely = float(max(lowest)) + CLEAR * course.noise.single
-    return max(float(np.median([knee.level for knee in knees])), surely)
+def _passed_by_all(curve: PressureCurve, breakpoints: Sequence[Breakpoint]) -> float:
+    """The usual pressure (Pa) of ``breakpoints``, or a higher one that all curves fall below."""
+    lowest = [curve.pressure[slice(*point.rows)].min() for point in breakpoints]
+    surely = float(max(lowest)) + CLEAR * curve.noise.single
+    return max(float(np.median([point.level for point in breakpoints])), surely)
 
 
-def _passes(course: Course, knee: Knee, level: float) -> float:
+def _passes(curve: PressureCurve, point: Breakpoint, level: float) -> float:
     """Time (s) at which the curve about a breakpoint falls to ``level``; NaN if it does not."""
-    begin, end = knee.rows
-    below = course.pressure[begin:end] <= level
+    begin, end = point.rows
+    below = curve.pressure[begin:end] <= level
     row = int(below.argmax())
     if row == 0:
         return np.nan
     rows = [begin + row, begin + row - 1]
-    return float(np.interp(level, course.pressure[rows], course.time[rows]))
+    return float(np.interp(level, curve.pressure[rows], curve.time[rows]))
 
 
-def _difference(course: Course, knees: Sequence[Knee], times: Floats) -> float:
+def _difference(curve: PressureCurve, breakpoints: Sequence[Breakpoint], times: Floats) -> float:
     """Sum of squares (Pa²) of the curves about ``times`` less the usual one."""
-    offsets = np.arange(-AROUND, AROUND, course.period)
-    ends = np.array([course.time[knee.rows[1] - 1] for knee in knees])
+    offsets = np.arange(-AROUND, AROUND, curve.period)
+    ends = np.array([curve.time[point.rows[1] - 1] for point in breakpoints])
     at = times[:, None] + offsets
-    values = np.where(at <= ends[:, None], np.interp(at, course.time, course.pressure), np.nan)
+    values = np.where(at <= ends[:, None], np.interp(at, curve.time, curve.pressure), np.nan)
     values = values[:, np.isfinite(values).any(axis=0)]
     return float(np.nansum((values - np.nanmedian(values, axis=0)) ** 2))
 
 
-def align(course: Course, knees: Sequence[Knee]) -> None:
-    """Align ``knees``, all of one kind, in place. One with a pressure step stays at its step."""
-    if len(knees) < FEWEST or np.mean([knee.stepped for knee in knees]) > 0.5:
+def align(curve: PressureCurve, breakpoints: Sequence[Breakpoint]) -> None:
+    """Align ``breakpoints`` of one kind in place. One with a pressure step stays at its step."""
+    if len(breakpoints) < FEWEST or np.mean([point.stepped for point in breakpoints]) > 0.5:
         return
-    half = _window(course, knees)
-    rows_per_point = max(1, round(half / course.period / POINTS))
-    grid = rows_per_point * course.period
+    half = _window(curve, breakpoints)
+    rows_per_point = max(1, round(half / curve.period / POINTS))
+    grid = rows_per_point * curve.period
     count = round(half / grid)
-    reach = min(FARTHEST + ROWS * course.period, SHARE * half)
+    reach = min(FARTHEST + ROWS * curve.period, SHARE * half)
     reach_count = count + int(np.ceil(reach / grid))
     offsets = np.arange(-float(reach_count), reach_count + 1.0) * grid
-    courses = _CourseAtKnees(course, rows_per_point, half, offsets, count)
-    times = np.array([knee.time for knee in knees])
-    ends = course.time[np.array([[knee.rows[0], knee.rows[1] - 1] for knee in knees])]
+    curves_at = _CurveAtBreakpoints(curve, rows_per_point, half, offsets, count)
+    times = np.array([point.time for point in breakpoints])
+    ends = curve.time[np.array([[point.rows[0], point.rows[1] - 1] for point in breakpoints])]
     for _ in range(ROUNDS):
-        mean_course = courses.mean_course(times, ends)
+        mean_curve = curves_at.mean_curve(times, ends)
         shifts = np.array(
             [
-                courses.shift_of(*knee_and_ends, mean_course, reach)
-                for knee_and_ends in zip(times, ends, strict=True)
+                curves_at.shift_of(*time_and_ends, mean_curve, reach)
+                for time_and_ends in zip(times, ends, strict=True)
             ]
         )
         times = times + shifts - np.median(shifts)
-        reach = max(NARROWS * reach, 2.0 * course.period)
-    times = times + courses.break_offset(times, ends, -1.0 if knees[0].on else 1.0)
-    for knee, time, (low, high) in zip(knees, times.tolist(), ends.tolist(), strict=True):
-        knee.time = min(max(time, low + course.period), high - course.period)
+        reach = max(NARROWS * reach, 2.0 * curve.period)
+    times = times + curves_at.break_offset(times, ends, -1.0 if breakpoints[0].on else 1.0)
+    for point, time, (low, high) in zip(breakpoints, times.tolist(), ends.tolist(), strict=True):
+        point.time = min(max(time, low + curve.period), high - curve.period)
 
 
-def _window(course: Course, knees: Sequence[Knee]) -> float:
+def _window(curve: PressureCurve, breakpoints: Sequence[Breakpoint]) -> float:
     """Window (s) on either side: precise times, and room for it at most breakpoints."""
-    period, noise = course.period, course.noise
+    period, noise = curve.period, curve.noise
     jump, scale = (
-        float(np.median(values)) for values in zip(*((k.jump, k.scale) for k in knees), strict=True)
+        float(np.median(values))
+        for values in zip(*((k.jump, k.scale) for k in breakpoints), strict=True)
     )
     wanted_sigma = max(WANTED, OF_A_ROW * period)
     wanted_window = max(
         OF_NOISE * noise.at(jump) / (jump * wanted_sigma) ** 2, LEAST_ROWS * period, LEAST
     )
     room = [
-        min(knee.time - course.time[knee.rows[0]], course.time[knee.rows[1] - 1] - knee.time)
-        for knee in knees
+        min(point.time - curve.time[point.rows[0]], curve.time[point.rows[1] - 1] - point.time)
+        for point in breakpoints
     ]
     shortest = 6.0 * period
     limits = max(ROOM * float(np.quantile(room, 0.25)), shortest), max(scale, shortest)
@@ -208,10 +211,10 @@ def _window(course: Course, knees: Sequence[Knee]) -> float:
 
 
 @dataclass(frozen=True)
-class _CourseAtKnees:
+class _CurveAtBreakpoints:
     """The curve about breakpoints, at the same times before and after each."""
 
-    course: Course
+    curve: PressureCurve
     rows_per_point: int  # rows averaged in each value
     half: float  # s, compared on either side
     wide: Floats  # s, times about a breakpoint, with a margin for its shift
@@ -227,16 +230,16 @@ class _CourseAtKnees:
         """Pressure (Pa) about ``times``."""
         row_offsets = (
             np.arange(self.rows_per_point) - 0.5 * (self.rows_per_point - 1)
-        ) * self.course.period
+        ) * self.curve.period
         readings = np.interp(
-            (times[:, None] + row_offsets).ravel(), self.course.time, self.course.pressure
+            (times[:, None] + row_offsets).ravel(), self.curve.time, self.curve.pressure
         )
         means: Floats = readings.reshape(-1, self.rows_per_point).mean(axis=1)
         return means
 
-    def mean_course(self, times: Floats, ends: Floats) -> Floats:
+    def mean_curve(self, times: Floats, ends: Floats) -> Floats:
         """Common curve (Pa) about all breakpoints, less their own levels and slopes."""
-        columns = _knee_columns(self.wide / self.half)
+        columns = _break_columns(self.wide / self.half)
         shape_columns, residuals = list[Floats](), list[Floats]()
         for time, (low, high) in zip(times, ends, strict=True):
             inside = (time + self.wide >= low) & (time + self.wide <= high)
@@ -292,7 +295,7 @@ class _CourseAtKnees:
         return self.half * float(offsets[best]) if np.isfinite(rss[best]) else 0.0
 
 
-def _knee_columns(u: Floats) -> npt.NDArray[np.float64]:
+def _break_columns(u: Floats) -> npt.NDArray[np.float64]:
     """Columns of a curve with a rounded break at 0: cubics on either side, and bends about it."""
     after = np.maximum(u, 0.0)
     columns = [u**0, u, u * u, u**3, after, after**2, after**3]

@@ -175,7 +175,7 @@ class Noise:
         return max(2.0 * MAINS if self.hum else 0.0, 8.0 * self.correlated)
 
 
-class Course(NamedTuple):
+class PressureCurve(NamedTuple):
     """Usable readings in order of time."""
 
     time: Floats  # s
@@ -225,14 +225,14 @@ def hinge(left: int, right: int) -> Floats:
     return filter_
 
 
-def closer(course: Course, rows: Rows, row: int, window: int, jump: float) -> tuple[int, int]:
+def closer(curve: PressureCurve, rows: Rows, row: int, window: int, jump: float) -> tuple[int, int]:
     """Follow a break to shorter windows while it stays significant: its row and last window (rows).
 
     If a line rings, each swing breaks the slope: the first one is the break. ``jump`` is negative
     if the slope decreases.
     """
-    density = course.noise.at(abs(jump))
-    while (half := window // 2) >= 6 and half * course.period >= course.noise.window:
+    density = curve.noise.at(abs(jump))
+    while (half := window // 2) >= 6 and half * curve.period >= curve.noise.window:
         rows_per_bin = max(1, half // AT_ONCE)
         bins = max(half // rows_per_bin, 4)
         first = max(rows[0], row - half - bins * rows_per_bin - rows_per_bin)
@@ -241,13 +241,11 @@ def closer(course: Course, rows: Rows, row: int, window: int, jump: float) -> tu
         if count < 2 * bins + 3:
             break
         means = (
-            course.pressure[first : first + count * rows_per_bin]
+            curve.pressure[first : first + count * rows_per_bin]
             .reshape(count, rows_per_bin)
             .mean(axis=1)
         )
-        sigma = np.sqrt(density / (rows_per_bin * course.period)) * np.linalg.norm(
-            hinge(bins, bins)
-        )
+        sigma = np.sqrt(density / (rows_per_bin * curve.period)) * np.linalg.norm(hinge(bins, bins))
         significance = np.sign(jump) * np.correlate(means, hinge(bins, bins), "valid") / sigma
         if significance.max() < CLEAR:
             break
@@ -263,71 +261,69 @@ def closer(course: Course, rows: Rows, row: int, window: int, jump: float) -> tu
 
 
 def placed(
-    course: Course, rows: Rows, row: int, reach: int, most: int, jump: float
+    curve: PressureCurve, rows: Rows, row: int, reach: int, most: int, jump: float
 ) -> Break | None:
     """The break within ``reach`` of ``row``, in a window of at most ``most`` rows on either side.
 
     The window is as wide as the wanted precision of the time requires. None if there is no room.
     """
-    period = course.period
+    period = curve.period
     wanted = max(WANTED, OF_A_ROW * period)
-    density = course.noise.at(abs(jump))
-    shortest = max(LEAST_ROWS * period, LEAST, course.noise.window)
+    density = curve.noise.at(abs(jump))
+    shortest = max(LEAST_ROWS * period, LEAST, curve.noise.window)
     wanted_rows = max(OF_NOISE * density / (jump * wanted) ** 2, shortest) / period
     half = int(np.clip(round(wanted_rows), 8, max(most, 8)))
     best_break = None
     for _ in range(2):
         window = max(rows[0], row - half), min(rows[1], row + half + 1)
-        best_break = _best_break(
-            course, window, float(course.time[row]), reach, (POINTS, 0.0), jump
-        )
+        best_break = _best_break(curve, window, float(curve.time[row]), reach, (POINTS, 0.0), jump)
         if best_break is None:
             return None
-        row = course.row(best_break.time, rows)
+        row = curve.row(best_break.time, rows)
         reach = max(reach // 8, 2)
     return best_break
 
 
-def stepped(course: Course, rows: Rows, row: int, window: int, jump: float) -> Break | None:
+def stepped(curve: PressureCurve, rows: Rows, row: int, window: int, jump: float) -> Break | None:
     """The break about ``row`` if the pressure also jumps there, in the shortest clear window."""
     closest, reach = None, window
     while True:
         part = max(rows[0], row - window - reach // 2), min(rows[1], row + window + reach // 2 + 1)
         candidate = _best_break(
-            course, part, float(course.time[row]), reach, (STEP_POINTS, STEP_GAIN), jump
+            curve, part, float(curve.time[row]), reach, (STEP_POINTS, STEP_GAIN), jump
         )
         if candidate is None or candidate.clear < STEP_CLEAR or not candidate.stepped:
             return closest
-        closest, row = candidate, course.row(candidate.time, rows)
+        closest, row = candidate, curve.row(candidate.time, rows)
         if window <= 8:
             return closest
         window = max(window // 2, 8)
         reach = max(window // 2, 2)
 
 
-def rung(course: Course, rows: Rows, time: float, scale: float) -> Break | None:
+def rung(curve: PressureCurve, rows: Rows, time: float, scale: float) -> Break | None:
     """The point where the pressure first left its curve, if it came back to it before ``time``.
 
     A ringing line does that: a later swing may change the slope more than the first. The curve
     before it is approximately a parabola over ``scale`` (s).
     """
-    period, noise = course.period, course.noise
-    row = course.row(time, rows)
+    period, noise = curve.period, curve.noise
+    row = curve.row(time, rows)
     ringing_time = min(RINGS, 0.5 * scale)
     span = max(scale, LEAST_ROWS * period)
-    begin = max(course.row(time - ringing_time - span, rows), rows[0])
-    ends = course.row(time - ringing_time, rows)
+    begin = max(curve.row(time - ringing_time - span, rows), rows[0])
+    ends = curve.row(time - ringing_time, rows)
     if ends - begin < LEAST_ROWS or row - ends < 3:
         return None
-    x = (course.time[begin:row] - course.time[ends]) / span
-    fit = np.linalg.lstsq(np.vander(x[: ends - begin], 3), course.pressure[begin:ends], rcond=None)[
+    x = (curve.time[begin:row] - curve.time[ends]) / span
+    fit = np.linalg.lstsq(np.vander(x[: ends - begin], 3), curve.pressure[begin:ends], rcond=None)[
         0
     ]
     extrapolated = np.vander(x, 3) @ fit
     width = max(round(noise.correlated / period), 1) | 1
-    deviation = smoothed(course.pressure[begin:row] - extrapolated, width)[ends - begin :]
+    deviation = smoothed(curve.pressure[begin:row] - extrapolated, width)[ends - begin :]
     threshold = AWAY * max(
-        noise.single, float(np.std(course.pressure[begin:ends] - extrapolated[: ends - begin]))
+        noise.single, float(np.std(curve.pressure[begin:ends] - extrapolated[: ends - begin]))
     )
     highest = float(deviation.max())
     if highest < threshold + COMES_BACK * max(float(deviation[-1]), 0.0):
@@ -336,12 +332,17 @@ def rung(course: Course, rows: Rows, time: float, scale: float) -> Break | None:
     below = np.flatnonzero(deviation[:peak] < FOOT * highest)
     foot = int(below[-1]) + 1 if len(below) else 0
     return Break(
-        float(course.time[ends + foot]), float(extrapolated[ends - begin + foot]), 0.0, np.inf, True
+        float(curve.time[ends + foot]), float(extrapolated[ends - begin + foot]), 0.0, np.inf, True
     )
 
 
 def _best_break(
-    course: Course, rows: Rows, centre: float, reach: int, criteria: tuple[int, float], jump: float
+    curve: PressureCurve,
+    rows: Rows,
+    centre: float,
+    reach: int,
+    criteria: tuple[int, float],
+    jump: float,
 ) -> Break | None:
     """The best break within ``reach`` rows of the time ``centre``.
 
@@ -351,16 +352,16 @@ def _best_break(
     points, gain = criteria
     if rows[1] - rows[0] < 8:
         return None
-    time, pressure, point_time = course.thinned(rows, points)
+    time, pressure, point_time = curve.thinned(rows, points)
     time = time - centre
     mean, scale = float(pressure.mean()), float(np.abs(time[[0, -1]]).max())
-    low = max(-reach * course.period, time[0] + 2.5 * point_time)
-    high = min(reach * course.period, time[-1] - 2.5 * point_time)
+    low = max(-reach * curve.period, time[0] + 2.5 * point_time)
+    high = min(reach * curve.period, time[-1] - 2.5 * point_time)
     if high <= low:
         return None
     times = np.linspace(low, high, PLACES)
     y, sign = pressure - mean, np.sign(jump)
-    variance = course.noise.at(abs(jump)) / point_time
+    variance = curve.noise.at(abs(jump)) / point_time
     smooth, coefficients = fits(time / scale, y, times / scale, step=False)
     rss = np.where(sign * coefficients[:, 3] > 0.0, smooth, np.inf)
     with_step = False

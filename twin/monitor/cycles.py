@@ -77,7 +77,7 @@ class CycleView(NamedTuple):
     fit: bool  # it can be judged
 
 
-class Told(Protocol):
+class CycleKeyFigures(Protocol):
     """Key figures of a whole cycle."""
 
     @property
@@ -95,7 +95,7 @@ class Told(Protocol):
         ...
 
 
-class Teller(Protocol):
+class KeyFigureSource(Protocol):
     """A source of key figures."""
 
     def run_ahead(self, samples: Samples, ticks: Ticks, at_edge: bool) -> None:
@@ -104,7 +104,7 @@ class Teller(Protocol):
         ``at_edge``: they begin with a suction edge.
         """
 
-    def take(self, piece: Cycle) -> Told | None:
+    def take(self, piece: Cycle) -> CycleKeyFigures | None:
         """Take pieces of a CycleCutter in order; give the key figures of a cycle that has ended."""
 
 
@@ -226,15 +226,15 @@ def figures(cycle: Cycle, theta: Theta) -> dict[str, float]:
     result: dict[str, float] = {}
     broken_off = int(cycle.ticks["phase"][-1]) if cycle.cut_short else None
     by_phase = _by_phase(cycle.off, cycle.ticks, ambient)[:, : len(Phase)]
-    rows, sums, squares, knees, levels = by_phase.tolist()
+    rows, sums, squares, breakpoints, levels = by_phase.tolist()
     for phase, name in _NAMES:
         # The beginning of a phase that was cut short does not represent it.
         if phase != broken_off and rows[phase] >= FEWEST_ROWS:
             result[f"{name}_mean"] = sums[phase] / rows[phase]
             result[f"{name}_rms"] = math.sqrt(squares[phase] / rows[phase])
     for name, entered in (("h1_level", HOLD), ("h1_low_level", SUCTION)):
-        if knees[entered]:
-            result[name] = levels[entered] / knees[entered]
+        if breakpoints[entered]:
+            result[name] = levels[entered] / breakpoints[entered]
     if cycle.complete:
         usable = (cycle.samples["quality"] & UNUSABLE) == 0
         measured = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)

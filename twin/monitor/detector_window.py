@@ -12,8 +12,13 @@ from twin.model.dataset import DataSet, coefficients, swing
 from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
-from twin.monitor.simulated_switching import bend_in_free_run, seen
-from twin.monitor.switching_detector import SHORTEST_WINDOW, SIGNIFICANT, Knees, PhaseFinder
+from twin.monitor.simulated_switching import bend_in_free_run, detected_switching
+from twin.monitor.switching_detector import (
+    SHORTEST_WINDOW,
+    SIGNIFICANT,
+    DetectorSettings,
+    PhaseFinder,
+)
 from twin.signals import MBAR, MS, Phase, Samples
 
 SHARP, ROUNDED = 2.5, 2.0  # wanted significance over SIGNIFICANT, for a sharp and a rounded break
@@ -32,14 +37,14 @@ RINGS = 1.5  # highest ringing of a line over that of the free run
 MOST_APART = 2.0 / 3.0  # of H1's hysteresis: thresholds drift
 
 
-def knees_of(data: DataSet, sampling_ms: float | None = None) -> Knees:
+def detector_of(data: DataSet, sampling_ms: float | None = None) -> DetectorSettings:
     """Detector settings for a data set's unit, at its sampling or at ``sampling_ms``."""
     period = (sampling_ms or data.sensor.sampling_ms) * MS
     noise = data.sensor.noise_in_means(sampling_ms) * MBAR
-    return expected_knees(coefficients(data), noise, period)
+    return expected_detector(coefficients(data), noise, period)
 
 
-def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
+def expected_detector(theta: Theta, noise: float, period: float = MS) -> DetectorSettings:
     """Derive the detector's window from the change of the slope at H1 in this system.
 
     ``noise`` in Pa; rows come each ``period`` (s).
@@ -56,7 +61,7 @@ def expected_knees(theta: Theta, noise: float, period: float = MS) -> Knees:
     window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
     above_the_end = theta[c.AMBIENT] - theta[c.H1] - theta[c.END_RATIO] * theta[c.AMBIENT]
     to_the_end = above_the_end / bend  # at this slope
-    at_once = Knees(
+    at_once = DetectorSettings(
         window=window,
         longest=int(min(max(to_the_end, window), LONGEST_WINDOW)),
         noise=noise,
@@ -108,55 +113,55 @@ def free_runs(theta: Theta, period: float) -> tuple[Theta, int]:
     return leaky, rows
 
 
-def _as_in_free_run(knees: Knees, theta: Theta) -> Knees:
-    """``knees`` with the delays and the least distance of free runs.
+def _as_in_free_run(detector: DetectorSettings, theta: Theta) -> DetectorSettings:
+    """``detector`` with the delays and the least distance of free runs.
 
     Jet and sensor delay a breakpoint; the step at the port advances it. While that step oscillates
     in the line, the slope breaks again, but near the level of the last breakpoint. If the free run
     does not show how high, the window covers the oscillation, over which it averages out.
     """
-    leaky, rows = free_runs(theta, knees.period)
-    tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
+    leaky, rows = free_runs(theta, detector.period)
+    tight, leaking = detected_switching([theta, leaky], rows, replace(detector, on_shift=0))
     swing_period_rows = round(
-        swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / knees.period
+        swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / detector.period
     )
-    swing_rows = min(swing_period_rows, knees.again)
-    if tight.rings == 0.0 and knees.settled != NEVER and swing_rows > knees.window:
-        knees = replace(knees, window=swing_rows, longest=max(knees.longest, swing_rows))
-        tight, leaking = seen([theta, leaky], rows, replace(knees, on_shift=0))
-    most_rows = knees.on_shift + knees.window  # later, it is another breakpoint
+    swing_rows = min(swing_period_rows, detector.again)
+    if tight.rings == 0.0 and detector.settled != NEVER and swing_rows > detector.window:
+        detector = replace(detector, window=swing_rows, longest=max(detector.longest, swing_rows))
+        tight, leaking = detected_switching([theta, leaky], rows, replace(detector, on_shift=0))
+    most_rows = detector.on_shift + detector.window  # later, it is another breakpoint
     if AT_ONCE < tight.off_rows <= most_rows:
-        knees = replace(knees, off_shift=tight.off_rows)
+        detector = replace(detector, off_shift=tight.off_rows)
     if 0 < leaking.on_rows <= most_rows:
-        knees = replace(knees, on_shift=leaking.on_rows)
+        detector = replace(detector, on_shift=leaking.on_rows)
     apart = min(RINGS * tight.rings, MOST_APART * float(theta[c.H1] - theta[c.H1_LOW]))
-    again = max(knees.again, knees.on_shift, knees.off_shift)
+    again = max(detector.again, detector.on_shift, detector.off_shift)
     goes_off = float(theta[c.AMBIENT_NOMINAL]) - tight.off * MBAR
-    return replace(knees, again=again, apart=apart, goes_off=goes_off)
+    return replace(detector, again=again, apart=apart, goes_off=goes_off)
 
 
-def as_wide_as_needed(knees: Knees, blocks: Iterable[Samples]) -> Knees:
-    """``knees`` with the narrowest window that sees the nozzle go off in most suctions of a record.
+def select_window(detector: DetectorSettings, blocks: Iterable[Samples]) -> DetectorSettings:
+    """Settings with the narrowest window that sees the nozzle go off in most suctions of a record.
 
     A wider window finds breakpoints that an unexpectedly slow sensor has rounded. But it lags more
     and needs longer stretches. ``blocks`` are read again for each window.
     """
-    if knees.settled == NEVER:
-        return knees
-    best, (best_count, suctions) = knees, _count_nozzle_off(knees, blocks)
-    window = knees.window
-    while best_count < suctions and window < knees.longest:
-        window = min(2 * window, knees.longest)
-        wider = replace(knees, window=window)
+    if detector.settled == NEVER:
+        return detector
+    best, (best_count, suctions) = detector, _count_nozzle_off(detector, blocks)
+    window = detector.window
+    while best_count < suctions and window < detector.longest:
+        window = min(2 * window, detector.longest)
+        wider = replace(detector, window=window)
         if (count := _count_nozzle_off(wider, blocks)[0]) > best_count:
             best, best_count = wider, count
     return best
 
 
-def _count_nozzle_off(knees: Knees, blocks: Iterable[Samples]) -> tuple[int, int]:
+def _count_nozzle_off(detector: DetectorSettings, blocks: Iterable[Samples]) -> tuple[int, int]:
     """Number of suctions in which the detector sees the nozzle go off, and of all suctions."""
     suctions, nozzle_off, last_off, was_inside = 0, 0, 0, False
-    for phase in _phases(PhaseFinder(knees), blocks):
+    for phase in _phases(PhaseFinder(detector), blocks):
         inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
         number = suctions + np.cumsum(np.diff(inside, prepend=was_inside) & inside)
         with_hold = np.unique(number[phase == Phase.HOLD])

@@ -54,10 +54,10 @@ DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of
 FEWEST_BACK = 3  # least cycles until a change counts as ended, however large it was
 
 
-class Heard(NamedTuple):
+class CycleScores(NamedTuple):
     """Residual and scores of a cycle that can be evaluated."""
 
-    said: CycleResidual
+    residual: CycleResidual
     scores: Floats
     seconds: float  # duration of the cycle
 
@@ -116,10 +116,10 @@ class Isolation:
     ``days`` is the mean time between false alarms of any kind, for one ejector.
     """
 
-    def __init__(self, bank: ModelBank, listener: ScoreExtractor, days: float) -> None:
-        self._bank, self._listener = bank, listener
+    def __init__(self, bank: ModelBank, extractor: ScoreExtractor, days: float) -> None:
+        self._bank, self._extractor = bank, extractor
         self.days = days
-        self._suspects, count = listener.suspects, len(listener.suspects)
+        self._suspects, count = extractor.suspects, len(extractor.suspects)
         self._reference, self._usual = Reference.of(count), _Usual()
         self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # number of learned cycles
@@ -135,7 +135,7 @@ class Isolation:
         self._since = 0  # cycles since the change, while raised
         self._back = 0.0  # log odds that the unit is healthy again
         self._alike = np.zeros((count, count))  # cosines between signatures; 0 if unknown
-        ends = [suspect.parameter.range(listener.theta) for suspect in self._suspects]
+        ends = [suspect.parameter.range(extractor.theta) for suspect in self._suspects]
         steps = np.array([suspect.step for suspect in self._suspects])
         self._bounds = np.array(ends) / steps[:, None]
 
@@ -153,7 +153,7 @@ class Isolation:
         return [effect_of(name) for name in names]
 
     @property
-    def heard(self) -> tuple[CycleResidual, Floats]:
+    def last_scores(self) -> tuple[CycleResidual, Floats]:
         """Residual of the last cycle, and its scores as standard normal values."""
         return self._kept[-1], self._scored[-1]
 
@@ -164,36 +164,38 @@ class Isolation:
     @classmethod
     def of(cls, data: DataSet, healthy: Healthy, days: float) -> "Isolation":
         """The isolation for a data set's twin; compiles all functions, so that no block waits."""
-        listener = ScoreExtractor.of(data, healthy)
-        first = ModelBank(listener.theta, listener.suspects)
+        extractor = ScoreExtractor.of(data, healthy)
+        first = ModelBank(extractor.theta, extractor.suspects)
         drawn, expected = first.take(
             Cycle(0, np.zeros(2, SAMPLE), np.zeros(2, TICK), complete=False)
         )
         averaged(np.zeros(2, np.uint8), np.zeros(2), drawn, expected)
-        return cls(ModelBank(listener.theta, listener.suspects), listener, days)
+        return cls(ModelBank(extractor.theta, extractor.suspects), extractor, days)
 
-    def hear(self, views: Sequence[CycleView]) -> list[Heard | None]:
+    def extract(self, views: Sequence[CycleView]) -> list[CycleScores | None]:
         """Take views of cycles and pieces, in order; return scores, None if not comparable."""
         drawn = [self._bank.take(view.cycle) for view in views]
         self._ambient_is_measured = any("ambient" in told(view.cycle.samples) for view in views)
         residuals = [
-            self._listener.hear(view.cycle, *rows, view.figures)
+            self._extractor.extract(view.cycle, *rows, view.figures)
             if view.fit and view.cycle.complete
             else None
             for view, rows in zip(views, drawn, strict=True)
         ]
         return [
-            Heard(residual, residual.scores(), view.cycle.seconds) if residual else None
+            CycleScores(residual, residual.scores(), view.cycle.seconds) if residual else None
             for view, residual in zip(views, residuals, strict=True)
         ]
 
-    def judge(self, heard: Heard, far: float = 0.0, *, begins: bool = False) -> Verdict | None:
+    def judge(
+        self, cycle: CycleScores, far: float = 0.0, *, begins: bool = False
+    ) -> Verdict | None:
         """Update the probabilities with the next cycle in order.
 
         ``far`` is the deviation (sigmas) of this cycle alone if its figures are out: such a cycle
         is not learned. If another change ``begins`` with it, the cause is searched from it on.
         """
-        residual, scores, seconds = heard
+        residual, scores, seconds = cycle
         self._cycles += 1
         self._seconds += seconds
         step = self._normalizer.take(self._reference.standard(scores))
@@ -308,7 +310,7 @@ class Isolation:
         # The laws of a low supply and of weather are uncertain in proportion to their size.
         wider = {}
         for number in UNCERTAIN:
-            ways = sizes[number] * mean.unsure[:, self._listener.variant_of == number]
+            ways = sizes[number] * mean.unsure[:, self._extractor.variant_of == number]
             wider[number] = Covariance.of(covariance + low_rank(ways))
             white = wider[number].white(np.column_stack([mean.off, mean.signatures[:, number]]))
             here = slice(number, number + 1)
@@ -376,7 +378,7 @@ class Isolation:
                 causes[suspect.effect] = replace(first, share=first.share + probability)
                 continue
             size = suspect.parameter.reported(
-                float(sizes[number]) * suspect.step, self._listener.theta
+                float(sizes[number]) * suspect.step, self._extractor.theta
             )
             causes[suspect.effect] = Likeness(
                 suspect.effect, size, suspect.parameter.unit, probability

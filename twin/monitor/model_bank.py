@@ -149,7 +149,7 @@ class ModelBank:
     def __init__(self, theta: Theta, suspects: Sequence[Suspect] = SUSPECTS) -> None:
         self._theta = np.stack(hypotheses(theta, suspects), axis=1)
         self._state = kernel.new_state(self._theta.shape[1])
-        self._drawings = PredictionCache()
+        self._cache = PredictionCache()
         self._last_ns: int | None = None  # PLC time of the newest row
         self._phase = NO_PHASE  # phase of the newest row
         self._since = 0  # rows from the last breakpoint to the newest row
@@ -165,7 +165,7 @@ class ModelBank:
         run like a cached cycle.
         """
         drawn, stretches, _ = self._look(samples, ticks)
-        if not (at_edge and stretches and self._drawings.may_be(stretches)):
+        if not (at_edge and stretches and self._cache.could_hit(stretches)):
             end = len(samples) - 1  # the phase after the last row is not known yet
             self._step_to(end, samples, ticks, drawn)
 
@@ -179,7 +179,7 @@ class ModelBank:
         drawn, stretches, since = self._look(samples, ticks)
         if not cycle.complete:
             stretches = None
-        cached = self._drawings.like(stretches) if stretches else None
+        cached = self._cache.lookup(stretches) if stretches else None
         if stretches and cached:
             expected, self._state = cached.at(stretches, drawn), cached.state.copy()
             self._drawn_until_ns = cycle.end_ns
@@ -187,7 +187,7 @@ class ModelBank:
             self._step_to(len(samples), samples, ticks, drawn)
             expected = self._expected
             if stretches and self._clean_cycles >= SWUNG_IN:
-                self._drawings.add(CachedPrediction(stretches, drawn, expected, self._state.copy()))
+                self._cache.add(CachedPrediction(stretches, drawn, expected, self._state.copy()))
         self._clean_cycles = self._clean_cycles + 1 if stretches else 0
         self._last_ns, self._phase, self._since = cycle.end_ns, int(ticks["phase"][-1]), since
         self._stepped, self._expected = 0, self._expected[:0]

@@ -23,9 +23,9 @@ from twin.monitor.cycles import (
     MEASURED,
     Cycle,
     CycleCutter,
+    CycleKeyFigures,
     CycleView,
-    Teller,
-    Told,
+    KeyFigureSource,
     figures,
 )
 from twin.monitor.gaps import gap_event
@@ -39,7 +39,7 @@ from twin.signals import NS, SAMPLE, TICK, LastRow, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
     from twin.monitor.baseline import Baseline
-    from twin.monitor.isolation import Heard, Isolation, Verdict
+    from twin.monitor.isolation import CycleScores, Isolation, Verdict
 
 _UNFIT = int(Quality.OUT_OF_RANGE | Quality.OVERFLOW | Quality.STALE | Quality.BAD)
 # Share of a cycle's samples needed to judge it: commands seen late look like a deviation. Usual
@@ -110,7 +110,8 @@ class Monitor:
 
     settings: MonitorSettings
     theta: Theta
-    teller: Teller | None = None  # source of key figures for the event of each cycle
+    # Source of key figures for the event of each cycle.
+    key_figure_source: KeyFigureSource | None = None
     active: str = ""  # the standing alarm's effect, or UNKNOWN; empty while there is none
     isolation: "Isolation | None" = None
     clocks: ClockWatch | None = field(default_factory=ClockWatch)  # None: the PLC has none
@@ -178,8 +179,8 @@ class Monitor:
                 events += new_events
         yield samples[part:], ticks[part:], in_order(events)
         if begun := self._cutter.begun():
-            if self.teller:
-                self.teller.run_ahead(*begun)
+            if self.key_figure_source:
+                self.key_figure_source.run_ahead(*begun)
             if self.isolation:
                 self.isolation.run_ahead(*begun)
 
@@ -310,8 +311,11 @@ class Monitor:
         caches, and the time for a cycle in a replay is a third less.
         """
         views = [self._view(cycle, silent and cycle.cut_short) for cycle in cycles]
-        key_figures = [self.teller.take(cycle) if self.teller else None for cycle in cycles]
-        scores = self.isolation.hear(views) if self.isolation else [None] * len(cycles)
+        key_figures = [
+            self.key_figure_source.take(cycle) if self.key_figure_source else None
+            for cycle in cycles
+        ]
+        scores = self.isolation.extract(views) if self.isolation else [None] * len(cycles)
         concluded = map(self._conclude, views, key_figures, scores)
         checked = [[*self.reports.take(cycle)] if self.reports else [] for cycle in cycles]
         return [
@@ -337,7 +341,7 @@ class Monitor:
         return CycleView(cycle, before, cycle_figures, fit)
 
     def _conclude(
-        self, view: CycleView, key_figures: Told | None, scores: "Heard | None"
+        self, view: CycleView, key_figures: CycleKeyFigures | None, scores: "CycleScores | None"
     ) -> list[Event]:
         """Events of a cycle: its summary, and its alarm or clearing."""
         cycle, before, cycle_figures, judged = view
@@ -405,7 +409,7 @@ class Monitor:
         """Whether the isolation finds that cycles differ together."""
         return self.isolation is not None and self.isolation.stands
 
-    def _isolate(self, scores: "Heard | None", far: float, begins: bool) -> "Verdict | None":
+    def _isolate(self, scores: "CycleScores | None", far: float, begins: bool) -> "Verdict | None":
         """The isolation's verdict; it learns no cycle that is far out."""
         if self.isolation is None or scores is None:
             return None
@@ -623,7 +627,7 @@ def _silence_ns(last_fresh: np.void, row: np.void) -> int:
 def _summary(
     cycle: Cycle,
     cycle_figures: Mapping[str, float],
-    key_figures: Told | None,
+    key_figures: CycleKeyFigures | None,
     verdict: "Verdict | None",
 ) -> Event:
     """The event of a cycle, with the text of the key figures if there are any."""

@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.inference.levels import MAD_TO_SIGMA
-from twin.monitor.alignment import Knee, align, align_by_course, align_by_level
+from twin.monitor.alignment import Breakpoint, align, align_by_curve, align_by_level
 from twin.monitor.breakpoints import (
-    Course,
     Floats,
     Noise,
+    PressureCurve,
     Rows,
     closer,
     hinge,
@@ -84,14 +84,14 @@ class Levels:
     held: float = -np.inf  # pressure up to which the nozzle stays off
 
     @classmethod
-    def of(cls, knees: Sequence[Knee], suctions: int) -> "Levels":
+    def of(cls, breakpoints: Sequence[Breakpoint], suctions: int) -> "Levels":
         """Levels of the breakpoints found so far, in so many suctions."""
-        offs = np.array([knee.level for knee in knees if not knee.on])
+        offs = np.array([point.level for point in breakpoints if not point.on])
         if len(offs) <= OTHERS * suctions:
             return cls()
         off = float(np.median(offs))
-        rises = [knee.level - off for knee in knees if knee.on]
-        held = [knee.held for knee in knees if np.isfinite(knee.held)]
+        rises = [point.level - off for point in breakpoints if point.on]
+        held = [point.held for point in breakpoints if np.isfinite(point.held)]
         return cls(
             off,
             MAD_TO_SIGMA * float(np.median(np.abs(offs - off))),
@@ -124,14 +124,16 @@ def switchings(
     time, pressure, sucks, rows = _readings(samples, phase)
     if np.count_nonzero(sucks) < LEAST_ROWS:
         return []
-    course = Course(time, pressure, noise)
+    curve = PressureCurve(time, pressure, noise)
     suctions = list(_suctions(time, sucks, noise.period))
     reported = samples["reported"][rows]
-    knees = _all_knees(course, suctions, usual)
-    switch_times = [(knee.time, knee.on) for knee in knees]
+    breakpoints = _all_breakpoints(curve, suctions, usual)
+    switch_times = [(point.time, point.on) for point in breakpoints]
     if reports_nozzle(reported[sucks]):
         switch_times = sorted(
-            _reported_switchings(time, suctions, knees, (reported & np.uint8(Reported.NOZZLE)) != 0)
+            _reported_switchings(
+                time, suctions, breakpoints, (reported & np.uint8(Reported.NOZZLE)) != 0
+            )
         )
     return [Switching(int(rows[np.searchsorted(time, at)]), on, at) for at, on in switch_times]
 
@@ -151,7 +153,7 @@ def told_edges(on: npt.NDArray[np.bool_]) -> list[int]:
 
 
 def _reported_switchings(
-    time: Floats, suctions: Sequence[Rows], shown: Sequence[Knee], on: npt.NDArray[np.bool_]
+    time: Floats, suctions: Sequence[Rows], shown: Sequence[Breakpoint], on: npt.NDArray[np.bool_]
 ) -> Iterator[tuple[float, bool]]:
     """Time (s) of each reported switching, and whether the nozzle went on.
 
@@ -161,7 +163,9 @@ def _reported_switchings(
     rows = np.array([a + row for a, b in suctions for row in told_edges(on[a:b])], np.int64)
     for opens in (False, True):
         reported = time[rows[on[rows] == opens]]
-        delays = np.array([[knee.time for knee in shown if knee.on == opens]]) - reported[:, None]
+        delays = (
+            np.array([[point.time for point in shown if point.on == opens]]) - reported[:, None]
+        )
         delays = np.column_stack([delays, np.full(len(reported), np.inf)])  # there may be none
         delays = delays[np.arange(len(reported)), np.abs(delays).argmin(axis=1)]
         is_shown = np.abs(delays) < TOLD_WITHIN
@@ -199,42 +203,46 @@ def _falls(pressure: Floats, suctions: Iterable[Rows]) -> Floats:
     return np.concatenate(parts)
 
 
-def _all_knees(course: Course, suctions: Sequence[Rows], usual: float) -> list[Knee]:
+def _all_breakpoints(
+    curve: PressureCurve, suctions: Sequence[Rows], usual: float
+) -> list[Breakpoint]:
     """All breakpoints that the pressure of a record shows, in order of time."""
     levels: Levels | None = None
-    knees = list[Knee]()
+    breakpoints = list[Breakpoint]()
     for _ in range(2):
-        knees = [
-            knee
+        breakpoints = [
+            point
             for suction in suctions
-            for knee in _Suction(course, suction, levels, usual).knees()
+            for point in _Suction(curve, suction, levels, usual).breakpoints()
         ]
-        levels = Levels.of(knees, len(suctions))
+        levels = Levels.of(breakpoints, len(suctions))
     for on in (False, True):
-        align(course, [knee for knee in knees if knee.on == on])
-    align_by_level(course, [knee for knee in knees if not knee.on])
+        align(curve, [point for point in breakpoints if point.on == on])
+    align_by_level(curve, [point for point in breakpoints if not point.on])
     for later in (False, True):
-        align_by_course(course, [knee for knee in knees if not knee.on and knee.later == later])
-    return sorted(knees, key=lambda knee: knee.time)
+        align_by_curve(
+            curve, [point for point in breakpoints if not point.on and point.later == later]
+        )
+    return sorted(breakpoints, key=lambda point: point.time)
 
 
 @dataclass(frozen=True)
 class _Suction:
     """One suction, and the levels of all suctions if they are known."""
 
-    course: Course
+    curve: PressureCurve
     rows: Rows
     levels: Levels | None
     usual: float  # Pa, or NaN
 
-    def knees(self) -> Iterator[Knee]:
+    def breakpoints(self) -> Iterator[Breakpoint]:
         """Breakpoints of the suction in order: off, on, off, and so on."""
         first, last = self.rows
         if last - first < LEAST_ROWS:
             return
-        smooth = smoothed(self.course.pressure[first:last], self.course.noise.width)
+        smooth = smoothed(self.curve.pressure[first:last], self.curve.noise.width)
         depth = float(smooth[0] - smooth.min())
-        if depth < max(LEAST_VACUUM, LEAST_NOISE * self.course.noise.single):
+        if depth < max(LEAST_VACUUM, LEAST_NOISE * self.curve.noise.single):
             return
         edges = [0, *self._restarts(smooth, depth), len(smooth)]
         room = first
@@ -249,14 +257,14 @@ class _Suction:
                 yield off
                 return
             on = self._on(off, first + end)
-            off.rows = (room, self.course.row(on.time, on.rows))
+            off.rows = (room, self.curve.row(on.time, on.rows))
             yield off
             yield on
-            room = self.course.row(on.time, on.rows)
+            room = self.curve.row(on.time, on.rows)
 
     def _restarts(self, smooth: Floats, depth: float) -> list[int]:
         """Rows at which the pressure falls again because the nozzle went on."""
-        least = max(TURN * self.course.noise.quiet, TURN_SHARE * depth)
+        least = max(TURN * self.curve.noise.quiet, TURN_SHARE * depth)
         least_rise = LIKE_OTHERS * self.levels.hysteresis if self.levels else 0.0
         off_until = self.levels.held - least if self.levels else -np.inf
         begin = int((smooth < smooth[0] - HALFWAY * depth).argmax())
@@ -281,19 +289,19 @@ class _Suction:
                 restarts.append(high)
         return restarts[1:]
 
-    def _off(self, smooth: Floats, first: int, last: int, again: bool) -> Knee | None:
+    def _off(self, smooth: Floats, first: int, last: int, again: bool) -> Breakpoint | None:
         """The breakpoint at which the nozzle goes off in one fall; None if it does not.
 
         If it goes on ``again``, it must have gone off.
         """
-        course = self.course
+        curve = self.curve
         later = first > self.rows[0]
         lowest = float(smooth.min())
         depth = float(smooth[0]) - lowest
         high, low = LATER_FALL if later else FIRST_FALL
         begin = _first_below(smooth, lowest + high * depth, 0)
         rows = max(_first_below(smooth, lowest + low * depth, len(smooth)) - begin, 4)
-        scale = rows * course.period
+        scale = rows * curve.period
         slope = (high - low) * depth / scale
         best = self._clearest_break(_Fall(first, last, begin, rows, slope, depth, later))
         if not again:
@@ -306,19 +314,19 @@ class _Suction:
         jump = max(best.share if best else 1.0, 0.2) * slope
         window = max(best.window if best else rows // 4, 6)
         rows_around = first + max(begin - rows, 0), last
-        row, window = closer(course, rows_around, row, window, jump)
-        placed_break = placed(course, rows_around, row, max(window // 2, 3), max(rows, 8), jump)
-        row = course.row(placed_break.time, rows_around) if placed_break else row
-        stepped_break = stepped(course, rows_around, row, max(window, rows // 4, 12), jump)
+        row, window = closer(curve, rows_around, row, window, jump)
+        placed_break = placed(curve, rows_around, row, max(window // 2, 3), max(rows, 8), jump)
+        row = curve.row(placed_break.time, rows_around) if placed_break else row
+        stepped_break = stepped(curve, rows_around, row, max(window, rows // 4, 12), jump)
         best_break = stepped_break or placed_break
         time, level = (
-            (best_break.time, best_break.level) if best_break else (float(course.time[row]), lowest)
+            (best_break.time, best_break.level) if best_break else (float(curve.time[row]), lowest)
         )
-        if first_swing := rung(course, rows_around, time, scale):
+        if first_swing := rung(curve, rows_around, time, scale):
             time, level = first_swing.time, first_swing.level
             stepped_break = first_swing
         jump = placed_break.jump if placed_break and not stepped_break else jump
-        return Knee(
+        return Breakpoint(
             False, time, level, (first, last), jump, scale, stepped_break is not None, later
         )
 
@@ -337,16 +345,16 @@ class _Suction:
 
     def _clearest_break(self, fall: "_Fall") -> "_SlopeBreak | None":
         """The most significant break of the slope that is like that of the nozzle going off."""
-        course = self.course
+        curve = self.curve
         rows_per_bin = max(1, fall.scale // BINS)
-        bin_time = rows_per_bin * course.period
+        bin_time = rows_per_bin * curve.period
         count = (fall.last - fall.first) // rows_per_bin
-        means = course.pressure[fall.first : fall.first + count * rows_per_bin]
+        means = curve.pressure[fall.first : fall.first + count * rows_per_bin]
         means = means.reshape(count, rows_per_bin).mean(axis=1)
         padded = np.pad(means, 1, "edge")  # a line without flow raises the pressure at once
         level = np.minimum(np.minimum(padded[:-2], padded[2:]), means)
-        sigma = np.sqrt(course.noise.at(fall.slope) / bin_time)
-        side = int(np.ceil(course.noise.side / bin_time))
+        sigma = np.sqrt(curve.noise.at(fall.slope) / bin_time)
+        side = int(np.ceil(curve.noise.side / bin_time))
         windows = {max(int(fall.scale / rows_per_bin * width), side, 4) for width in BEFORE}
         best = None
         for before, after in sorted(
@@ -381,28 +389,28 @@ class _Suction:
                 )
         return best
 
-    def _on(self, off: Knee, row: int) -> Knee:
+    def _on(self, off: Breakpoint, row: int) -> Breakpoint:
         """The breakpoint at which the nozzle goes on, about the turn at ``row``."""
-        course = self.course
-        first = course.row(off.time, (off.rows[0], row))
+        curve = self.curve
+        first = curve.row(off.time, (off.rows[0], row))
         last = self.rows[1]
         since = max(row - first, 6)
         half = max(min(since // 2, ON_WINDOW), 2)
         before, after = max(row - half, 0), min(row + half, last - 1)
-        turn_pressure = float(course.pressure[row])
-        jump = max(turn_pressure - float(course.pressure[before]), 0.0) / (half * course.period)
-        jump += max(turn_pressure - float(course.pressure[after]), 0.0) / (half * course.period)
+        turn_pressure = float(curve.pressure[row])
+        jump = max(turn_pressure - float(curve.pressure[before]), 0.0) / (half * curve.period)
+        jump += max(turn_pressure - float(curve.pressure[after]), 0.0) / (half * curve.period)
         jump = max(jump, 1e-3)
-        reach = max(3, min(since // 4, int(ON_WITHIN / course.period)))
-        rows_around, scale = (first + 1, last), since * course.period
-        knee = Knee(True, float(course.time[row]), turn_pressure, (first, last), jump, scale)
-        placed_break = placed(course, rows_around, row, reach, max(since, 8), -jump)
-        if stepped_break := stepped(course, rows_around, row, max(half, 12), -jump):
-            knee.time, knee.level, knee.stepped = stepped_break.time, stepped_break.level, True
+        reach = max(3, min(since // 4, int(ON_WITHIN / curve.period)))
+        rows_around, scale = (first + 1, last), since * curve.period
+        point = Breakpoint(True, float(curve.time[row]), turn_pressure, (first, last), jump, scale)
+        placed_break = placed(curve, rows_around, row, reach, max(since, 8), -jump)
+        if stepped_break := stepped(curve, rows_around, row, max(half, 12), -jump):
+            point.time, point.level, point.stepped = stepped_break.time, stepped_break.level, True
         elif placed_break:
-            knee.time, knee.level = placed_break.time, placed_break.level
-            knee.jump = placed_break.jump
-        return knee
+            point.time, point.level = placed_break.time, placed_break.level
+            point.jump = placed_break.jump
+        return point
 
 
 class _Fall(NamedTuple):

@@ -37,7 +37,7 @@ class Stretches:
         differ[:, 2] = LEVEL
         return differ
 
-    def may_go_as(self, cached: "Stretches") -> bool:
+    def could_match(self, cached: "Stretches") -> bool:
         """Whether an unfinished cycle may still be similar to a known one.
 
         Later rows cannot remove a difference.
@@ -48,7 +48,7 @@ class Stretches:
         difference[-1, :2] = np.maximum(difference[-1, :2], 0.0)  # the last stretch may continue
         return bool((np.abs(difference) <= cached.may_differ[: len(difference)]).all())
 
-    def far(self, cached: Sequence["Stretches"]) -> Floats:
+    def distances_from(self, cached: Sequence["Stretches"]) -> Floats:
         """Distances of a whole cycle from cached ones with the same phases; inf if not similar."""
         deviation = np.abs(self.how - np.array([stretches.how for stretches in cached]))
         deviation /= np.array([stretches.may_differ for stretches in cached])
@@ -88,22 +88,22 @@ class PredictionCache:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def add(self, drawing: CachedPrediction) -> None:
+    def add(self, prediction: CachedPrediction) -> None:
         """Add a prediction; a full cache drops the least recently used one."""
-        self._kept = [*self._kept, drawing][-KEPT:]
+        self._kept = [*self._kept, prediction][-KEPT:]
 
-    def may_be(self, stretches: Stretches) -> bool:
+    def could_hit(self, stretches: Stretches) -> bool:
         """Whether an unfinished cycle may still be similar to a cached one."""
-        return any(stretches.may_go_as(prediction.stretches) for prediction in self._kept)
+        return any(stretches.could_match(prediction.stretches) for prediction in self._kept)
 
-    def like(self, stretches: Stretches) -> CachedPrediction | None:
+    def lookup(self, stretches: Stretches) -> CachedPrediction | None:
         """The prediction of the most similar cycle; None if none is similar."""
         candidates = [
             candidate for candidate in self._kept if candidate.stretches.phases == stretches.phases
         ]
         if not candidates:
             return None
-        distances = stretches.far([candidate.stretches for candidate in candidates])
+        distances = stretches.distances_from([candidate.stretches for candidate in candidates])
         nearest = candidates[int(distances.argmin())]
         if not np.isfinite(distances.min()):
             return None

@@ -33,7 +33,7 @@ SCATTERING: Mapping[str, Parameter] = dict(
 SCATTER: Mapping[str, tuple[str, float]] = {
     name: (parameter.name, parameter.healthy_sigma) for name, parameter in SCATTERING.items()
 }
-KNEE_MBAR = 0.7  # sigma of the level at a breakpoint, to which the model is set
+BREAK_LEVEL_MBAR = 0.7  # sigma of the level at a breakpoint, to which the model is set
 FIRST_ERROR = ModelError(after_ms=(0.0,), common_mbar=(2.0,), alone_mbar=(0.5,))  # not learned
 ON_THE_PART_S = 5e-3  # s after suction began: cups that meet the part sooner were on it before
 SCAN_MS = 1.0  # cycle time of a PLC's fast task
@@ -113,8 +113,8 @@ def lasting(bins: Bins, rows: Ints, alone: Floats) -> Floats:
     These are the model's error of each cycle, ``alone`` (mbar), and that of a breakpoint's level.
     """
     stretch, kind, time = bins.stretch[rows], bins.kind[rows], bins.time[rows]
-    knee = KNEE_MBAR * ((kind == _HOLD) | (kind == AGAIN))
-    return fading(alone, time, stretch) + low_rank(knee[:, None], stretch)
+    level_error = BREAK_LEVEL_MBAR * ((kind == _HOLD) | (kind == AGAIN))
+    return fading(alone, time, stretch) + low_rank(level_error[:, None], stretch)
 
 
 class Reading(NamedTuple):

@@ -20,7 +20,7 @@ from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
 from twin.monitor.measured_supply import LEAST, MOST, is_possible
 from twin.monitor.rows import time_steps
-from twin.monitor.switching_detector import Knees, PhaseFinder
+from twin.monitor.switching_detector import DetectorSettings, PhaseFinder
 from twin.quality import BREAK, UNUSABLE
 from twin.signals import BAR, MBAR, NS, SL_MIN, Command, Phase, Reported, Samples, Ticks
 
@@ -68,7 +68,7 @@ class _View:
     suction: Rows
     idle: Rows
     theta: Theta
-    knees: Knees
+    detector: DetectorSettings
 
     @cached_property
     def ambient(self) -> tuple[float, float]:
@@ -97,7 +97,9 @@ class _View:
         return float(np.median(readings)) if len(readings) >= FEWEST else float("nan")
 
 
-def check(cycle: Cycle, theta: Theta, knees: Knees) -> dict[str, Contradiction | None]:
+def check(
+    cycle: Cycle, theta: Theta, detector: DetectorSettings
+) -> dict[str, Contradiction | None]:
     """Outcome of a whole cycle for each present signal, by its tag; None if it agrees."""
     samples = cycle.samples
     if not _has_reports(samples):
@@ -106,18 +108,20 @@ def check(cycle: Cycle, theta: Theta, knees: Knees) -> dict[str, Contradiction |
     pressure = np.where(usable, samples["pressure"], np.nan).astype(np.float64)
     commands = samples["commands"] & (Command.SUCTION | Command.BLOW_OFF)
     suction, idle = commands == Command.SUCTION, commands == 0
-    view = _View(samples, cycle.ticks, pressure, suction, idle, theta, knees)
+    view = _View(samples, cycle.ticks, pressure, suction, idle, theta, detector)
     outcomes: dict[str, Contradiction | None] = {}
     for check_signal in (_nozzle, _part, _barometer, _second_pressure, _flow, _supply):
         outcomes |= check_signal(view)
     return outcomes
 
 
-def standing(cycles: Iterable[Cycle], theta: Theta, knees: Knees) -> list[Contradiction]:
+def standing(
+    cycles: Iterable[Cycle], theta: Theta, detector: DetectorSettings
+) -> list[Contradiction]:
     """Contradictions of a record that occur in more than half of the cycles with an outcome."""
     outcomes_by_signal: dict[str, list[Contradiction | None]] = {}
     for cycle in cycles:
-        for signal, contradiction in check(cycle, theta, knees).items():
+        for signal, contradiction in check(cycle, theta, detector).items():
             outcomes_by_signal.setdefault(signal, []).append(contradiction)
     grouped = (
         (outcomes, [contradiction for contradiction in outcomes if contradiction is not None])
@@ -155,11 +159,11 @@ def _unreported(view: _View, on: Rows) -> dict[str, Contradiction | None]:
     """Check for a nozzle that is reported on although the pressure shows it off."""
     unreported = view.samples.copy()
     unreported["reported"], unreported["quality"] = 0, unreported["quality"] & ~np.uint8(BREAK)
-    finder = PhaseFinder(view.knees)
+    finder = PhaseFinder(view.detector)
     phase = np.concatenate([finder.push(unreported)[1], finder.flush()[1]])
     went_off = (phase[1:] == Phase.HOLD) & (phase[:-1] == Phase.SUCTION)
     for row in (np.flatnonzero(went_off) + 1).tolist():
-        window = slice(max(row - 2 * view.knees.about, 0), row + 2 * view.knees.about)
+        window = slice(max(row - 2 * view.detector.about, 0), row + 2 * view.detector.about)
         if on[window].all():
             finding = (
                 "the pressure shows that the nozzle goes off at"
@@ -177,8 +181,8 @@ def _keeps_evacuating(view: _View, on: Rows) -> dict[str, Contradiction | None]:
     if not len(off):
         return {}
     for part in np.split(off, np.flatnonzero(np.diff(off) > 1) + 1):
-        begin = part[0] + view.knees.about
-        if part[0] == np.flatnonzero(view.suction)[0] or part[-1] - begin < view.knees.about:
+        begin = part[0] + view.detector.about
+        if part[0] == np.flatnonzero(view.suction)[0] or part[-1] - begin < view.detector.about:
             continue  # the nozzle has not gone on yet, or was off too briefly
         first, last = (
             float(np.nanmean(view.pressure[row : row + FEWEST]))
@@ -362,7 +366,7 @@ class ReportWatch:
     """Turns cycles into events: a signal contradicts the pressure, or agrees again."""
 
     theta: Theta
-    knees: Knees
+    detector: DetectorSettings
     _standing: dict[str, Contradiction] = field(default_factory=dict)  # reported contradictions
     _opposing: dict[str, int] = field(default_factory=dict)  # successive cycles against the report
 
@@ -370,7 +374,7 @@ class ReportWatch:
         """Check a cycle; an incomplete one is ignored."""
         if not cycle.complete:
             return
-        for signal, contradiction in check(cycle, self.theta, self.knees).items():
+        for signal, contradiction in check(cycle, self.theta, self.detector).items():
             if (contradiction is None) == (signal not in self._standing):
                 self._opposing[signal] = 0
                 continue

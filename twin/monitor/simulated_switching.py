@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from twin.model import dense_solver as strides
+from twin.model import dense_solver
 from twin.model import theta as c
 from twin.model.plant import reading_of
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.breakpoints import Noise
 from twin.monitor.offline_switching import switchings
-from twin.monitor.switching_detector import SHORTEST_WINDOW, Knees, PhaseFinder
+from twin.monitor.switching_detector import SHORTEST_WINDOW, DetectorSettings, PhaseFinder
 from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples
 
 IDLE_ROWS = 50  # idle rows before the cycle
@@ -31,7 +31,7 @@ _RESPONSES = {Phase.HOLD: c.RESPONSE_OFF, Phase.SUCTION: c.RESPONSE}
 
 
 @dataclass(frozen=True)
-class Seen:
+class DetectedSwitching:
     """Vacuum (mbar) at which the detector saw the nozzle go off and on; NaN if it did not switch.
 
     ``*_rows`` are rows from the valve's action to the breakpoint. ``*_above`` is the breakpoint's
@@ -58,14 +58,16 @@ class Seen:
         return off if np.isnan(self.off) else self.off, on if np.isnan(self.on) else self.on
 
 
-def seen(thetas: Sequence[Theta], rows: int, knees: Knees) -> list[Seen]:
+def detected_switching(
+    thetas: Sequence[Theta], rows: int, detector: DetectorSettings
+) -> list[DetectedSwitching]:
     """Run the model free through ``rows`` of suction from rest, and detect its switchings.
 
     The model steps by a millisecond, like the control of an ejector; rows have the period of
-    ``knees``.
+    ``detector``.
     """
-    samples = _suction(rows, knees.period)
-    return [_detect(samples, _run(theta, rows, knees.period), knees) for theta in thetas]
+    samples = _suction(rows, detector.period)
+    return [_detect(samples, _run(theta, rows, detector.period), detector) for theta in thetas]
 
 
 def shows_late(theta: Theta, rows: int, noise: Noise, name: Phase) -> float:
@@ -112,7 +114,7 @@ def _run(theta: Theta, rows: int, period: float) -> "_Run":
     steps_per_row = max(round(period / MS), 1)
     commands = np.full((IDLE_ROWS + rows) * steps_per_row, Command.SUCTION, np.uint8)
     commands[: IDLE_ROWS * steps_per_row] = 0
-    phase, expected = strides.simulate(theta, np.full(len(commands), MS), commands)
+    phase, expected = dense_solver.simulate(theta, np.full(len(commands), MS), commands)
     return _Run(theta, phase, phase[::steps_per_row], expected[::steps_per_row], period)
 
 
@@ -135,16 +137,16 @@ class _Run(NamedTuple):
         return switched[0] * MS + float(self.theta[_RESPONSES[name]]) if len(switched) else np.nan
 
 
-def _detect(samples: Samples, run: _Run, knees: Knees) -> Seen:
+def _detect(samples: Samples, run: _Run, detector: DetectorSettings) -> DetectedSwitching:
     samples["pressure"] = run.expected
-    finder = PhaseFinder(knees)
+    finder = PhaseFinder(detector)
     (_, early, low), (_, late, high) = finder.push(samples), finder.flush()
     detected, level = np.concatenate([early, late]), np.concatenate([low, high])
     off = _first_switching(run, detected, level, Phase.HOLD)
     on = _first_switching(run, detected, level, Phase.SUCTION)
-    rings = _rings(run, FALLS * knees.noise)
+    rings = _rings(run, FALLS * detector.noise)
     thresholds = _read_at(run.theta, c.H1), _read_at(run.theta, c.H1_LOW)
-    return Seen(off[0], on[0], off[1], on[1], off[2], on[2], rings, thresholds)
+    return DetectedSwitching(off[0], on[0], off[1], on[1], off[2], on[2], rings, thresholds)
 
 
 def _first_switching(
@@ -152,13 +154,15 @@ def _first_switching(
 ) -> tuple[float, int, float]:
     """Vacuum, rows and level above the reading, for the first switching into ``name``."""
     switched, before = _switched(run.phase, name) + 1, _OTHER[name]
-    knees = np.flatnonzero(np.isfinite(level) & (detected == name))
-    knees = knees[np.isin(detected[knees - 1], (before, name)) & (knees > IDLE_ROWS + 1)]
-    if not len(switched) or not len(knees):
+    break_rows = np.flatnonzero(np.isfinite(level) & (detected == name))
+    break_rows = break_rows[
+        np.isin(detected[break_rows - 1], (before, name)) & (break_rows > IDLE_ROWS + 1)
+    ]
+    if not len(switched) or not len(break_rows):
         return np.nan, 0, 0.0
-    rows = int(knees[0] - switched[0] - run.rows(_RESPONSES[name]))
-    vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[knees[0]]) / MBAR
-    return float(vacuum), rows, float(level[knees[0]] - run.expected[knees[0]])
+    rows = int(break_rows[0] - switched[0] - run.rows(_RESPONSES[name]))
+    vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[break_rows[0]]) / MBAR
+    return float(vacuum), rows, float(level[break_rows[0]] - run.expected[break_rows[0]])
 
 
 def _switched(phase: Bytes, name: Phase) -> Ints:

@@ -3,7 +3,8 @@
 While monitoring, a switching is found from the rows up to now and a few later ones. A log has them
 all, and other suctions that show where the nozzle switches. So a diagnosis learns from the whole
 log which switchings there are, and when. The detector, whose errors free runs of the model have as
-well, finds the knee of each and no others; where it finds none, the valve acts as the log shows.
+well, finds the breakpoint of each and no others; where it finds none, the valve acts as the log
+shows.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,19 +20,21 @@ from twin.monitor.breakpoints import Floats, Noise
 from twin.monitor.detector_window import NEVER, free_runs
 from twin.monitor.offline_switching import noise_of, shows_suction, switchings
 from twin.monitor.simulated_switching import shows_late
-from twin.monitor.switching_detector import BEYOND, SIGNIFICANT, Knees, commanded
+from twin.monitor.switching_detector import BEYOND, SIGNIFICANT, DetectorSettings, commanded
 from twin.quality import BREAK, UNUSABLE
 from twin.signals import MS, NS, SAMPLE, Command, Phase, Reported, Samples, joined
 
 PIECE = 500_000  # rows that are searched at once, with the rest of their cycle
 LONGEST_PIECE = 4 * PIECE  # also if suction lasts on
-ABOUT = 20.0 * MS  # s, from the switching that the log shows to the detector's knee
+ABOUT = 20.0 * MS  # s, from the switching that the log shows to the detector's breakpoint
 SHOWS = 40.0 * MS  # s before suction ends: a later switching does not show in the slope
 Bytes = npt.NDArray[np.uint8]
 _KNOWN, _ON = np.uint8(Reported.NOZZLE_KNOWN), np.uint8(Reported.NOZZLE)
 
 
-def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Knees, Bytes | None]:
+def smoothed(
+    theta: Theta, detector: DetectorSettings, blocks: Iterable[Samples]
+) -> tuple[DetectorSettings, Bytes | None]:
     """Settings of the detector for a whole log, and bits of ``Reported`` for each of its rows.
 
     The nozzle is not known where suction is not commanded, where the beginning of suction is
@@ -40,23 +43,23 @@ def smoothed(theta: Theta, knees: Knees, blocks: Iterable[Samples]) -> tuple[Kne
     valve's action as in free runs of the model with coefficients ``theta``. ``blocks`` are read
     once more.
     """
-    if knees.settled == NEVER or theta[c.AIR_SAVING] == c.OFF:
-        return knees, None
+    if detector.settled == NEVER or theta[c.AIR_SAVING] == c.OFF:
+        return detector, None
     search, nozzles = None, [np.empty(0, np.uint8)]
     for piece in _pieces(blocks):
-        samples, phase, _ = commanded(piece, knees.blow_off)
+        samples, phase, _ = commanded(piece, detector.blow_off)
         if (samples["reported"] & _KNOWN).any():
-            return knees, None
+            return detector, None
         if not shows_suction(samples, phase):
             nozzles.append(np.zeros(len(samples), np.uint8))
             continue
         samples = _timed_forwards(samples)
-        search = search or _Search.of(theta, knees, noise_of(samples, phase))
+        search = search or _Search.of(theta, detector, noise_of(samples, phase))
         nozzles.append(search.nozzle(samples, phase))
-    apart = max(knees.off_shift, knees.on_shift) + max(
-        knees.window // 2, round(ABOUT / knees.period)
+    apart = max(detector.off_shift, detector.on_shift) + max(
+        detector.window // 2, round(ABOUT / detector.period)
     )
-    return replace(knees, about=apart, acts=(0, 0)), np.concatenate(nozzles)
+    return replace(detector, about=apart, acts=(0, 0)), np.concatenate(nozzles)
 
 
 def _pieces(blocks: Iterable[Samples]) -> Iterator[Samples]:
@@ -93,12 +96,12 @@ class _Search:
     late: tuple[float, float]  # s, from the valve's action until its closing and its opening show
 
     @classmethod
-    def of(cls, theta: Theta, knees: Knees, noise: Noise) -> "_Search":
-        leaky, rows = free_runs(theta, knees.period)
-        as_sampled = replace(noise, period=knees.period)
+    def of(cls, theta: Theta, detector: DetectorSettings, noise: Noise) -> "_Search":
+        leaky, rows = free_runs(theta, detector.period)
+        as_sampled = replace(noise, period=detector.period)
         off = shows_late(theta, rows, as_sampled, Phase.HOLD)
         on = shows_late(leaky, rows, as_sampled, Phase.SUCTION)
-        return cls(noise, knees.goes_off, (off, on))
+        return cls(noise, detector.goes_off, (off, on))
 
     def nozzle(self, samples: Samples, phase: Bytes) -> Bytes:
         """The bits of a piece."""

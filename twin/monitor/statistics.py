@@ -17,7 +17,7 @@ from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, averaged
 from twin.monitor.cycles import Cycle
-from twin.monitor.detector_window import knees_of
+from twin.monitor.detector_window import detector_of
 from twin.monitor.healthy import Healthy
 from twin.monitor.model_bank import (
     DELAYS,
@@ -36,8 +36,8 @@ from twin.monitor.scatter_covariance import (
     lasting,
     model_error,
 )
-from twin.monitor.simulated_switching import seen
-from twin.monitor.switching_detector import Knees
+from twin.monitor.simulated_switching import detected_switching
+from twin.monitor.switching_detector import DetectorSettings
 from twin.signals import MBAR
 
 PER_UNIT = 2  # bins in each unit of warped time
@@ -107,7 +107,7 @@ class ScoreExtractor:
     theta: Theta
     healthy: Healthy
     noise: float  # mbar, of a row
-    knees: Knees
+    detector: DetectorSettings
     suspects: Sequence[Suspect] = SUSPECTS
     _levels: Floats = field(init=False)  # mbar, change of each level, (levels, hypotheses)
     _means: Floats = field(init=False)  # mbar, of each level in healthy cycles
@@ -118,11 +118,11 @@ class ScoreExtractor:
     def of(cls, data: DataSet, healthy: Healthy) -> "ScoreExtractor":
         """The extractor for cycles with the twin of a data set."""
         theta, noise = coefficients(data), data.sensor.noise_in_means()
-        return cls(theta, healthy, noise, knees_of(data), suspects_of(data, theta))
+        return cls(theta, healthy, noise, detector_of(data), suspects_of(data, theta))
 
     def __post_init__(self) -> None:
         thetas = hypotheses(self.theta, self.suspects)
-        runs = seen(thetas, round(SUCTION / self.knees.period), self.knees)
+        runs = detected_switching(thetas, round(SUCTION / self.detector.period), self.detector)
         vacuum = np.array([scatter.levels for scatter in runs]).T
         self._levels = np.nan_to_num(derivatives(vacuum)[1])
         scatters = [self.healthy.figures.get(name) for name in LEVELS]
@@ -135,7 +135,7 @@ class ScoreExtractor:
             [scatter.sigma if scatter else self.healthy.unseen_level_mbar for scatter in scatters]
         )
 
-    def hear(
+    def extract(
         self, cycle: Cycle, drawn: Ints, expected: Floats, figures: Mapping[str, float]
     ) -> CycleResidual | None:
         """Residuals of a whole cycle; None without bins.
@@ -156,7 +156,7 @@ class ScoreExtractor:
         count = len(self.suspects)
         suspects, larger, varied = np.split(changes, (count, count + len(DELAYS) * LARGER), axis=1)
         contact = by_contact(
-            bins, cells.first, drawn, expected[:, 0] / MBAR, self.theta, self.knees.period
+            bins, cells.first, drawn, expected[:, 0] / MBAR, self.theta, self.detector.period
         )
         moves = np.hstack(
             [self._moves(suspects[: len(cells.first)]), contact * self.healthy.meets_ms]

@@ -42,7 +42,7 @@ MOST_MISSING = 0.5  # largest share of unusable rows in a line
 # Indices of the finder's state.
 # Ages are in rows; that of suction restarts at a breakpoint, and is −1 without a suction command.
 # The level of the last breakpoint is NaN before the first one of a suction.
-_NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _KNEE_LEVEL = range(6)
+_NOZZLE, _AGE, _BEST, _BEST_AGE, _BEST_LEVEL, _BREAK_LEVEL = range(6)
 _IDLE_AGE, _IDLE_SUM, _ANCHORED = range(6, 9)
 # In this suction: breakpoints, rows since it began, reported switchings that were overdue, and the
 # reported nozzle after these (1 on, 0 off, -1 none yet).
@@ -54,7 +54,7 @@ _IDLE, _SUCTION, _HOLD, _BLOW_OFF = (int(phase) for phase in Phase)
 
 
 @dataclass(frozen=True)
-class Knees:
+class DetectorSettings:
     """Settings of the detector: rows of the window, noise (Pa), delays from valve to breakpoint.
 
     Rows come each ``period`` (s). The nozzle's closing shows ``off_shift`` rows later, its opening
@@ -172,12 +172,12 @@ def _break_at(
     left, left_mean = _line(pressure, row - window, window + 1)
     significance = (right - left) / (math.sqrt(2.0) * sigma)
     if nozzle_on:
-        is_knee = left < 3.0 * sigma
+        is_breakpoint = left < 3.0 * sigma
     else:
         significance = -significance
-        is_knee = left > -3.0 * sigma
+        is_breakpoint = left > -3.0 * sigma
     level = left_mean + left * window / 2.0  # by the line before: the pressure may ring after it
-    if not is_knee or significance < SIGNIFICANT:
+    if not is_breakpoint or significance < SIGNIFICANT:
         return 0.0, level
     jump, height = _greatest_jump(pressure, row - window, row + window)
     if height > JUMP * noise:
@@ -252,7 +252,7 @@ def _rows_behind(may_bend: bool, is_told: bool, settings: _Floats) -> int:
 @per_row
 def _start(state: _Floats, pressure: _Floats, row: int, level: _Floats) -> None:
     """Begin a suction, with the nozzle on."""
-    state[_NOZZLE], state[_BEST], state[_KNEE_LEVEL] = 1.0, 0.0, math.nan
+    state[_NOZZLE], state[_BEST], state[_BREAK_LEVEL] = 1.0, 0.0, math.nan
     state[_SWITCHED] = state[_REPORTS] = 0.0
     state[_SINCE] = state[_SAID] = -1.0
     if state[_IDLE_AGE] >= FEWEST_IDLE_ROWS:
@@ -322,7 +322,7 @@ def _track_break(
     if may_bend:
         significance, break_level = _break_at(pressure, row, window, noise, nozzle_on)
         level_change = (
-            break_level - state[_KNEE_LEVEL]
+            break_level - state[_BREAK_LEVEL]
         )  # up while the nozzle is off, down while it is on
         if (-level_change if nozzle_on else level_change) < settings[6]:  # a line that rings
             significance = 0.0
@@ -335,12 +335,12 @@ def _track_break(
         return
     state[_BEST_AGE] += 1.0
     if state[_BEST_AGE] >= window // 2:
-        knee = row - int(state[_BEST_AGE])
+        break_row = row - int(state[_BEST_AGE])
         shift = int(settings[2] if nozzle_on else settings[3])
-        level[knee] = state[_KNEE_LEVEL] = state[_BEST_LEVEL]
-        phase[knee - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
+        level[break_row] = state[_BREAK_LEVEL] = state[_BEST_LEVEL]
+        phase[break_row - shift : row + 1] = _HOLD if nozzle_on else _SUCTION
         if nozzle_on:
-            state[_OFF_LEVEL] = _level_before(pressure, knee - shift)
+            state[_OFF_LEVEL] = _level_before(pressure, break_row - shift)
         state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
         state[_SWITCHED] += 1.0
         state[_AGE] = (
@@ -362,7 +362,7 @@ def _decide_by_level(
     """At the last row of a suction, decide by the pressure whether the nozzle went off.
 
     That is where the pressure fell below the one at which it went off before. If that was so long
-    ago that the knee would show, the nozzle did not go off.
+    ago that the breakpoint would show, the nozzle did not go off.
     """
     fallen = state[_OFF_LEVEL] - pressure[row]
     least = max(SIGNIFICANT * settings[1], BEYOND)
@@ -402,7 +402,7 @@ def _reported_switches(
 
 @compiled
 def _is_denied(state: _Floats, reported: _Bytes, row: int, settings: _Floats) -> bool:
-    """Whether the ejector reports no switching about a row that belongs to no other knee."""
+    """Whether the ejector reports no switching about a row that belongs to no other breakpoint."""
     if reported[row] & _KNOWN == 0:
         return False
     about, begin = int(settings[7]), row - int(state[_SINCE])
@@ -448,7 +448,7 @@ def _follow_report(
     phase: _Bytes,
     level: _Floats,
 ) -> None:
-    """Take a report of the past; if no knee has shown it, set one by the report alone."""
+    """Take a report of the past; if no breakpoint has shown it, set one by the report alone."""
     new_reports, state[_SAID] = _reported_switches(
         reported,
         report_row,
@@ -462,14 +462,15 @@ def _follow_report(
         return
     nozzle_on, window = state[_NOZZLE] > 0.0, int(settings[0])
     acts = int(min(settings[8] if nozzle_on else settings[9], settings[7]))
-    knee = report_row + acts
-    if knee > row:  # suction ends first
+    break_row = report_row + acts
+    if break_row > row:  # suction ends first
         return
-    level[knee] = state[_KNEE_LEVEL] = _level_before(pressure, knee)
-    phase[knee : row + 1] = _HOLD if nozzle_on else _SUCTION
+    level[break_row] = state[_BREAK_LEVEL] = _level_before(pressure, break_row)
+    phase[break_row : row + 1] = _HOLD if nozzle_on else _SUCTION
     state[_NOZZLE], state[_BEST] = 0.0 if nozzle_on else 1.0, 0.0
     state[_SWITCHED] += 1.0
-    state[_AGE] = (row - knee) + window + settings[4] - settings[5]  # as after a knee that shows
+    # As after a breakpoint that shows.
+    state[_AGE] = (row - break_row) + window + settings[4] - settings[5]
 
 
 Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
@@ -478,9 +479,9 @@ Found = tuple[Samples, npt.NDArray[np.uint8], npt.NDArray[np.float64]]
 def commanded(samples: Samples, blow_off: tuple[float, float]) -> Found:
     """Phases of a whole record by commands alone, and levels before its cycles.
 
-    ``blow_off`` is the ejector's own, as in ``Knees``.
+    ``blow_off`` is the ejector's own, as in ``DetectorSettings``.
     """
-    finder = PhaseFinder(Knees(0, 0.0, 0, 0, 0, 0, 0, blow_off=blow_off))
+    finder = PhaseFinder(DetectorSettings(0, 0.0, 0, 0, 0, 0, 0, blow_off=blow_off))
     early, late = finder.push(samples), finder.flush()
     return (
         joined(early[0], late[0]),
@@ -496,7 +497,7 @@ class PhaseFinder:
     ``nozzle`` replaces what the ejector reports of it: bits as in ``Reported`` of all rows to come.
     """
 
-    knees: Knees
+    detector: DetectorSettings
     nozzle: npt.NDArray[np.uint8] | None = None
     _state: npt.NDArray[np.float64] = field(default_factory=lambda: np.array(_BEGINNING))
     _rows: Samples = field(default_factory=lambda: np.empty(0, SAMPLE))
@@ -506,7 +507,7 @@ class PhaseFinder:
     _timer: npt.NDArray[np.float64] = field(default_factory=new_timer)  # of the blow-off
     _phase: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, "u1"))
     _level: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    _seen: int = 0  # rows of _rows that were searched
+    _searched: int = 0  # rows of _rows that were searched
     _given: int = 0  # rows of _rows that were given out and stay as context
     _dropped: int = 0  # rows so far that are no more among _rows
 
@@ -534,7 +535,7 @@ class PhaseFinder:
         self._state, self._rows = np.array(_BEGINNING), np.empty(0, SAMPLE)
         self._valve_commands, self._timer = np.empty(0, "u1"), new_timer()
         self._phase, self._level = np.empty(0, "u1"), np.empty(0)
-        self._seen = self._given = 0
+        self._searched = self._given = 0
         return remaining
 
     def _search(self, stretch: Samples) -> Found:
@@ -542,16 +543,16 @@ class PhaseFinder:
         self._rows = joined(self._rows, stretch)
         self._phase = np.concatenate([self._phase, np.zeros(len(stretch), "u1")])
         self._level = np.concatenate([self._level, np.full(len(stretch), np.nan)])
-        settled = self._run(self.knees.window)
+        settled = self._run(self.detector.window)
         ready = slice(self._given, max(settled, self._given))
         settled_rows = self._rows[ready], self._phase[ready], self._level[ready]
         self._given = ready.stop
-        reach = self.knees.window + self.knees.lag + self.knees.about
+        reach = self.detector.window + self.detector.lag + self.detector.about
         context = max(reach, IDLE_ROWS)  # rows that later rows need
-        drop = min(max(self._seen - context, 0), self._given)
+        drop = min(max(self._searched - context, 0), self._given)
         self._rows, self._phase = self._rows[drop:], self._phase[drop:]
         self._level, self._valve_commands = self._level[drop:], self._valve_commands[drop:]
-        self._seen -= drop
+        self._searched -= drop
         self._dropped += drop
         self._given -= drop
         return settled_rows
@@ -565,7 +566,7 @@ class PhaseFinder:
             self._timer,
             np.ascontiguousarray(stretch["commands"]),
             dt,
-            *self.knees.blow_off,
+            *self.detector.blow_off,
             valve_commands,
         )
         return valve_commands
@@ -574,19 +575,21 @@ class PhaseFinder:
         """Search as far as the rows reach; returns the first row that may still change."""
         pressure = self._rows["pressure"].astype(np.float64)
         pressure[(self._rows["quality"] & UNUSABLE) != 0] = np.nan
-        knees = self.knees
-        shifts = knees.off_shift, knees.on_shift
-        again = max(knees.again, window)
+        detector = self.detector
+        shifts = detector.off_shift, detector.on_shift
+        again = max(detector.again, window)
         settings = np.array(
             [
-                *(window, knees.noise, *shifts, knees.settled, again),
-                *(knees.apart, knees.about, *knees.acts),
+                *(window, detector.noise, *shifts, detector.settled, again),
+                *(detector.apart, detector.about, *detector.acts),
             ],
             np.float64,
         )
         rows = pressure, self._reported(), self._valve_commands
-        self._seen = _find(self._state, *rows, self._seen, settings, self._phase, self._level)
-        return self._seen - int(_unsettled(self._state, settings))
+        self._searched = _find(
+            self._state, *rows, self._searched, settings, self._phase, self._level
+        )
+        return self._searched - int(_unsettled(self._state, settings))
 
     def _reported(self) -> npt.NDArray[np.uint8]:
         """The reported nozzle in each row: the ejector's reports, or ``nozzle`` instead."""

@@ -24,7 +24,7 @@ Clock = Callable[[], int]
 Floats = npt.NDArray[np.float64]
 
 
-class Teller(Protocol):
+class MessageSource(Protocol):
     """Makes messages for one topic from the loop's blocks."""
 
     topic: str

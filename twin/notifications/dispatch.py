@@ -10,7 +10,7 @@ from typing import Any
 from twin.assets.unit import Unit
 from twin.errors import in_words
 from twin.events import Event
-from twin.notifications.data import Teller
+from twin.notifications.data import MessageSource
 from twin.notifications.message import Message, of_event, restated
 from twin.notifications.outbox import Outbox
 from twin.notifications.sender import Sender, box_of
@@ -28,8 +28,8 @@ class Outlets:
     """Sends the alarms of a unit and further data to destinations (``twin.live.Sink``).
 
     One thread writes into the outbox, and one for each destination delivers. ``restating`` names
-    the destinations that get every alarm's state at the start. ``tellers`` make the further data of
-    each destination.
+    the destinations that get every alarm's state at the start. ``message_sources`` make the further
+    data of each destination.
     """
 
     def __init__(
@@ -40,15 +40,15 @@ class Outlets:
         say: Callable[[str], None],
         *,
         restating: Sequence[str] = (),
-        tellers: Mapping[str, Sequence[Teller]] | None = None,
+        message_sources: Mapping[str, Sequence[MessageSource]] | None = None,
         uploader: Uploader | None = None,
     ) -> None:
         self._unit, self._open_outbox, self._senders = unit, open_outbox, senders
         self._say, self._restating, self._uploader = say, restating, uploader
-        self._tellers = [
-            (box_of(name, teller.topic), teller)
-            for name, group in (tellers or {}).items()
-            for teller in group
+        self._message_sources = [
+            (box_of(name, source.topic), source)
+            for name, group in (message_sources or {}).items()
+            for source in group
         ]
         self._outbox: Outbox | None = None
         self._failed = False
@@ -77,8 +77,8 @@ class Outlets:
             for message in of_event(self._unit, event):
                 for sender in self._senders:
                     self._put(sender.name, message)
-        for box, teller in self._tellers:
-            for message in teller.tell(samples, ticks, events):
+        for box, source in self._message_sources:
+            for message in source.tell(samples, ticks, events):
                 self.tell(box, message)
 
     def tell(self, box: str, message: Message) -> None:
@@ -101,8 +101,8 @@ class Outlets:
             self._uploader.end()
             if not self._uploader.join(CLOSE_S / 2):
                 self._say("an upload does not end: it begins anew with the next run")
-        for box, teller in self._tellers:
-            for message in teller.rest():
+        for box, source in self._message_sources:
+            for message in source.rest():
                 self.tell(box, message)
         self._ending.set()
         self._news.set()

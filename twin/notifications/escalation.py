@@ -31,7 +31,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
-class Told:
+class LastMail:
     """When a person was told last, and how often the alarm had been raised by then."""
 
     time_ns: int
@@ -51,7 +51,7 @@ class Call:
     count: int = 1  # times that it was raised
     is_open: bool = True
     is_handled: bool = False  # by a person; being raised again begins another call
-    told: Mapping[str, Told] = field(default_factory=dict)  # by address
+    told: Mapping[str, LastMail] = field(default_factory=dict)  # by address
 
     def to_json(self) -> str:
         """The call as text for a database."""
@@ -61,7 +61,7 @@ class Call:
     def from_json(cls, text: str) -> "Call":
         """The call that ``to_json`` has written."""
         values = json.loads(text)
-        told = {address: Told(**entry) for address, entry in values.pop("told").items()}
+        told = {address: LastMail(**entry) for address, entry in values.pop("told").items()}
         return cls(told=told, **values)
 
 
@@ -164,7 +164,9 @@ class Escalation:
         for person in self._people:
             if reason := self._reason(call, person, now_ns):
                 outcome.mails.append(_mail(call, person, reason))
-                call = replace(call, told={**call.told, person.address: Told(now_ns, call.count)})
+                call = replace(
+                    call, told={**call.told, person.address: LastMail(now_ns, call.count)}
+                )
         calls[call.alarm] = call
 
     def _escalated(self, call: Call, now_ns: int) -> Call:

@@ -39,7 +39,7 @@ class Mqtt:
     """A channel (``twin.notifications.sender.Channel``) for the messages of one unit.
 
     Paths are relative to ``folder``. ConfigError if a secret or certificate cannot be used. A
-    request is acknowledged to the broker unless ``hear_request`` raises.
+    request is acknowledged to the broker unless ``on_request`` raises.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class Mqtt:
         say: Say,
         clock: Callable[[], int] = time.time_ns,
         batch: str = "",
-        hear_request: Callable[[bytes], None] | None = None,
+        on_request: Callable[[bytes], None] | None = None,
     ) -> None:
         self._settings, self._unit, self._clock = settings, unit, clock
-        self._asset, self._hear_request = asset_of(unit, batch), hear_request
+        self._asset, self._on_request = asset_of(unit, batch), on_request
         secret = settings.password
         self._password = secret.read("[mqtt] password", folder, say) if secret else None
         self._tls: ssl.SSLContext | None = None
@@ -94,7 +94,7 @@ class Mqtt:
         with suppress(LostError):  # a broker that rejects us answers first, then disconnects
             self._listen_until(lambda: self._let_in is not None, CONNECT_S)
         forgotten = self._settle()
-        if self._hear_request is not None:
+        if self._on_request is not None:
             self._ask_for_requests(client)
         self._say_status("online")
         self._is_first, was_first = False, self._is_first
@@ -199,8 +199,8 @@ class Mqtt:
 
     def _on_message(self, _client: Client, _userdata: Any, message: MQTTMessage) -> None:
         """Handle a request; an error leaves the library's loop before the acknowledgement."""
-        if self._hear_request is not None and not message.retain:
-            self._hear_request(bytes(message.payload))
+        if self._on_request is not None and not message.retain:
+            self._on_request(bytes(message.payload))
 
     def _say_status(self, status: str) -> None:
         body = of_status(self._asset, status, self._clock(), _program())

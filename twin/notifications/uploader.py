@@ -77,7 +77,7 @@ class Uploader:
         self._thread.join(patience_s)
         return not self._thread.is_alive()
 
-    def hear(self, payload: bytes) -> None:
+    def receive(self, payload: bytes) -> None:
         """Take a request and answer it; SourceError if it cannot be stored and must come again."""
         try:
             request = parse(payload)

@@ -31,7 +31,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from twin.alarms.state import Deed
+from twin.alarms.state import AlarmAction
 from twin.alarms.statistics import in_words, statistics
 from twin.audit import Act
 from twin.errors import TwinError
@@ -63,12 +63,12 @@ MOST_DIGITS = 18  # of a number, so that it fits into a database
 NO_REQUEST = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 SLOWEST_S = 20.0  # limit for a browser to take one message, or to send a request's body
 NEEDED: dict[str, Role] = {  # role that a request to an alarm needs
-    Deed.ACKNOWLEDGED: Role.ACKNOWLEDGE,
-    Deed.SHELVED: Role.ACKNOWLEDGE,
-    Deed.UNSHELVED: Role.ACKNOWLEDGE,
+    AlarmAction.ACKNOWLEDGED: Role.ACKNOWLEDGE,
+    AlarmAction.SHELVED: Role.ACKNOWLEDGE,
+    AlarmAction.UNSHELVED: Role.ACKNOWLEDGE,
     Act.COMMENTED: Role.ACKNOWLEDGE,
-    Deed.OUT_OF_SERVICE: Role.CONFIGURE,  # without a time limit, and for every shift
-    Deed.IN_SERVICE: Role.CONFIGURE,
+    AlarmAction.OUT_OF_SERVICE: Role.CONFIGURE,  # without a time limit, and for every shift
+    AlarmAction.IN_SERVICE: Role.CONFIGURE,
     Act.LIMIT_CHANGED: Role.CONFIGURE,
 }
 
@@ -258,11 +258,11 @@ class Page:
             raise HTTPException(HTTPStatus.FORBIDDEN, missing)
         return session
 
-    async def _require_role(self, request: Request, session: Session, deed: str) -> None:
+    async def _require_role(self, request: Request, session: Session, action: str) -> None:
         """Require the role for a request, by the users' present roles, not those at the login."""
-        role, needed = self.users.role(session.user), NEEDED.get(deed, Role.CONFIGURE)
+        role, needed = self.users.role(session.user), NEEDED.get(action, Role.CONFIGURE)
         if role is None or not role.covers(needed):
-            await self._record(request, Act.DENIED, session.user, wanted=deed)
+            await self._record(request, Act.DENIED, session.user, wanted=action)
             raise HTTPException(
                 HTTPStatus.FORBIDDEN,
                 tr(
@@ -337,7 +337,7 @@ class Page:
         user: dict[str, Any] = {"user": "", "may": []}
         if session is not None:
             role = self.users.role(session.user)
-            may = [deed for deed, needed in NEEDED.items() if role and role.covers(needed)]
+            may = [action for action, needed in NEEDED.items() if role and role.covers(needed)]
             user = {"user": session.user, "csrf": session.csrf, "may": may}
         ejectors = [
             {"name": ejector.name, "type": ejector.config.asset.type} for ejector in self.ejectors
@@ -430,13 +430,13 @@ class Page:
         ejector = self._ejector(request)
         try:
             body = json.loads(await _body(request))
-            alarm, deed = str(body["alarm"]), str(body["deed"])
+            alarm, action = str(body["alarm"]), str(body["deed"])
             seconds = float(body.get("seconds", 0.0))
         except NO_REQUEST as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, "not a request") from error
-        await self._require_role(request, session, deed)
-        number = await run_sync(ejector.ask, alarm, deed, session.user, seconds)
-        await self._record(request, deed, session.user, unit=ejector.name, alarm=alarm)
+        await self._require_role(request, session, action)
+        number = await run_sync(ejector.ask, alarm, action, session.user, seconds)
+        await self._record(request, action, session.user, unit=ejector.name, alarm=alarm)
         return JSONResponse({"request": number}, HTTPStatus.ACCEPTED)
 
     async def comment(self, request: Request) -> Response:

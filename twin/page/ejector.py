@@ -16,7 +16,7 @@ from twin.alarms.database_url import open_chosen as open_alarms
 from twin.alarms.limits import UnitLimits
 from twin.alarms.requests import ASKABLE
 from twin.alarms.settings import AlarmSettings, board_rules
-from twin.alarms.state import Deed
+from twin.alarms.state import AlarmAction
 from twin.assets.unit import Unit
 from twin.config import Config
 from twin.errors import ConfigError, TwinError
@@ -140,18 +140,18 @@ class Ejector:
 
     # --- requests -------------------------------------------------------------------------------
 
-    def ask(self, alarm: str, deed: str, who: str, seconds: float) -> int:
+    def ask(self, alarm: str, action: str, who: str, seconds: float) -> int:
         """Send a request about an alarm to the run, like ``twin alarms``; returns its number.
 
         ConfigError for a request that no run would grant.
         """
-        if deed not in {deed_kind.value for deed_kind in ASKABLE}:
-            raise ConfigError(f"{deed!r} is nothing that can be asked of an alarm")
+        if action not in {deed_kind.value for deed_kind in ASKABLE}:
+            raise ConfigError(f"{action!r} is nothing that can be asked of an alarm")
         alarm_to_ask = Board(self._rules)[alarm]
-        if deed == Deed.SHELVED:
+        if action == AlarmAction.SHELVED:
             list(alarm_to_ask.shelve(0, seconds, who))  # raises where a run would refuse
         with self._alarms() as store:
-            number = store.ask(self._unit, alarm, Deed(deed), who, seconds)
+            number = store.ask(self._unit, alarm, AlarmAction(action), who, seconds)
         self._asked.add(number)
         return number
 

@@ -157,7 +157,7 @@ def priority_words(priority: str) -> str:
 
 
 def _request(request: Request) -> dict[str, Any]:
-    return {"deed": request.deed.value, "who": request.who, "at": request.asked_ns / S_NS}
+    return {"deed": request.action.value, "who": request.who, "at": request.asked_ns / S_NS}
 
 
 def instant_text(ns: int | None, now_ns: int) -> str:

@@ -48,7 +48,7 @@ class Row:
 
 
 @dataclass
-class Heard:
+class EjectorMessages:
     """The last messages of one ejector. Times are Unix seconds."""
 
     unit: Unit
@@ -84,7 +84,7 @@ class PlantOverview:
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self.clock = clock
         self._lock = threading.Lock()
-        self._ejectors: dict[Unit, Heard] = {}
+        self._ejectors: dict[Unit, EjectorMessages] = {}
         self._failure, self._since = "not connected yet", clock()
         self.not_understood = 0  # number of invalid messages
 
@@ -119,7 +119,7 @@ class PlantOverview:
         document = json.loads(payload)
         json.dumps(document, ensure_ascii=False).encode()  # raises for half a character
         handler = {STATUS: _status, ALARM: _alarm, CYCLE: _cycle, VALUES: _values}[topic]
-        ejector = self._ejectors.get(unit) or Heard(unit)
+        ejector = self._ejectors.get(unit) or EjectorMessages(unit)
         time = handler(ejector, document)
         now = self.clock()
         ejector.seen = max(ejector.seen, min(time, now)) if kept else now
@@ -137,7 +137,7 @@ class PlantOverview:
 
     # --- reading --------------------------------------------------------------------------------
 
-    def look(self, show: Callable[[list[Heard], str, float], Any]) -> Any:
+    def look(self, show: Callable[[list[EjectorMessages], str, float], Any]) -> Any:
         """The result of ``show`` for all ejectors, the broker's failure and since when."""
         with self._lock:
             return show(list(self._ejectors.values()), self._failure, self._since)
@@ -146,7 +146,7 @@ class PlantOverview:
 # --- message handlers: each returns the time of its message -------------------------------------
 
 
-def _status(ejector: Heard, document: Document) -> float:
+def _status(ejector: EjectorMessages, document: Document) -> float:
     _require(document, STATUS_FORMAT)
     status = document["status"]
     if status not in ("online", "offline"):
@@ -158,7 +158,7 @@ def _status(ejector: Heard, document: Document) -> float:
     return since or 0.0
 
 
-def _alarm(ejector: Heard, document: Document) -> float:
+def _alarm(ejector: EjectorMessages, document: Document) -> float:
     _require(document, ALARM_FORMAT)
     name, time = str(document["alarm"]), _time(document["time"])
     fields: dict[str, Any] = {key: bool(document[key]) for key in ("active", "acknowledged")}
@@ -174,7 +174,7 @@ def _alarm(ejector: Heard, document: Document) -> float:
     return time
 
 
-def _cycle(ejector: Heard, document: Document) -> float:
+def _cycle(ejector: EjectorMessages, document: Document) -> float:
     _require(document, CYCLE_FORMAT)
     time = int(document["time_ns"]) / 1e9
     values = array("f", (_or_nan(document.get(name)) for name in COLUMNS))
@@ -185,7 +185,7 @@ def _cycle(ejector: Heard, document: Document) -> float:
     return time
 
 
-def _values(ejector: Heard, document: Document) -> float:
+def _values(ejector: EjectorMessages, document: Document) -> float:
     _require(document, VALUES_FORMAT)
     rows = [_row(row) for row in document["rows"]]
     ejector.every_s = float(document["period_s"]) * len(rows)
@@ -206,7 +206,7 @@ def _require(document: Document, expected: str) -> None:
         raise ValueError
 
 
-def _batch(ejector: Heard, document: Document) -> None:
+def _batch(ejector: EjectorMessages, document: Document) -> None:
     ejector.batch = str(document["asset"].get("batch", ""))
 
 

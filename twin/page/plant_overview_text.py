@@ -27,7 +27,7 @@ from twin.page.ejector_status import (
     rank,
     state_words,
 )
-from twin.page.plant_overview import COLUMNS, NOT_UNDERSTOOD, Document, Heard, Row
+from twin.page.plant_overview import COLUMNS, NOT_UNDERSTOOD, Document, EjectorMessages, Row
 
 KEY_FIGURES = ("t0", "leakage", "air")  # key figures in the table
 SPARK_POINTS = 60
@@ -44,7 +44,9 @@ _RULES = {rule.name: rule for rule in by_cause(default_rules())}
 SILENT, NOT_KNOWN = "Silent", "Not known"
 
 
-def overview(ejectors: Sequence[Heard], failure: str, since: float, now: float) -> dict[str, Any]:
+def overview(
+    ejectors: Sequence[EjectorMessages], failure: str, since: float, now: float
+) -> dict[str, Any]:
     """A line for every ejector, the worst first; without a broker all are unknown."""
     lines = [_line(line, now, failure) for line in ejectors]
     order = [light.value for light in WORST_FIRST]
@@ -53,7 +55,7 @@ def overview(ejectors: Sequence[Heard], failure: str, since: float, now: float) 
     return document | {"trouble_since": _said(since, now) if failure else ""}
 
 
-def details(ejector: Heard, failure: str, now: float) -> dict[str, Any]:
+def details(ejector: EjectorMessages, failure: str, now: float) -> dict[str, Any]:
     """All that is known of one ejector."""
     return {
         **_line(ejector, now, failure),
@@ -65,7 +67,7 @@ def details(ejector: Heard, failure: str, now: float) -> dict[str, Any]:
     }
 
 
-def _line(ejector: Heard, now: float, failure: str) -> dict[str, Any]:
+def _line(ejector: EjectorMessages, now: float, failure: str) -> dict[str, Any]:
     light, words, since = _light(ejector, now, failure)
     standing = _standing(ejector)
     worst = standing[0] if standing else None
@@ -98,7 +100,7 @@ def _line(ejector: Heard, now: float, failure: str) -> dict[str, Any]:
 # --- the light ----------------------------------------------------------------------------------
 
 
-def _light(ejector: Heard, now: float, failure: str) -> tuple[Light, str, float | None]:
+def _light(ejector: EjectorMessages, now: float, failure: str) -> tuple[Light, str, float | None]:
     """Status, its text and since when; as on the technician's page, unknown is never green."""
     standing = _standing(ejector)
     if failure:
@@ -115,7 +117,7 @@ def _light(ejector: Heard, now: float, failure: str) -> tuple[Light, str, float 
     return Light.GREEN, WORDS[Light.GREEN], ejector.since
 
 
-def _without_alarm(ejector: Heard, words: str) -> str:
+def _without_alarm(ejector: EjectorMessages, words: str) -> str:
     """The text for an ejector without a standing alarm."""
     if words == WORDS[Light.GREY]:
         died = ejector.status == "offline" and ejector.since is None
@@ -124,7 +126,7 @@ def _without_alarm(ejector: Heard, words: str) -> str:
     return tr("no values come") if words == SILENT else "" if words == NOT_KNOWN else tr("no alarm")
 
 
-def _patience(ejector: Heard) -> float:
+def _patience(ejector: EjectorMessages) -> float:
     """How long (s) values may be missing before the ejector counts as silent."""
     return SILENT_S + 3.0 * ejector.every_s
 
@@ -134,7 +136,7 @@ def _is_urgent(alarm: Document) -> bool:
     return urgent and alarm["state"] == State.UNACKNOWLEDGED
 
 
-def _standing(ejector: Heard) -> list[Document]:
+def _standing(ejector: EjectorMessages) -> list[Document]:
     """Alarms beyond normal: unacknowledged and urgent ones first, then the oldest."""
     alarms = [
         alarm
@@ -193,7 +195,7 @@ def _title(alarm: str) -> dict[str, Any]:
 # --- numbers ------------------------------------------------------------------------------------
 
 
-def _newest(ejector: Heard) -> list[dict[str, Any]]:
+def _newest(ejector: EjectorMessages) -> list[dict[str, Any]]:
     """The table's key figures, each from the newest cycle that has it."""
     figures = []
     for name in KEY_FIGURES:
@@ -207,7 +209,7 @@ def _newest(ejector: Heard) -> list[dict[str, Any]]:
     return figures
 
 
-def _trends(ejector: Heard) -> list[dict[str, Any]]:
+def _trends(ejector: EjectorMessages) -> list[dict[str, Any]]:
     """Every figure that any cycle has, over time."""
     trends = []
     times = [time for time, _, _ in ejector.cycles]
@@ -247,7 +249,7 @@ def _plain(value: float) -> float | None:
     return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
-def of_one(ejectors: Sequence[Heard], unit: Unit) -> Heard | None:
+def of_one(ejectors: Sequence[EjectorMessages], unit: Unit) -> EjectorMessages | None:
     """The ejector of a unit; None if it is unknown."""
     return next((ejector for ejector in ejectors if ejector.unit == unit), None)
 
