@@ -1,6 +1,7 @@
 """Commissioning a unit that nobody has seen before, on rigs of a world that is not the model's."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -603,6 +604,20 @@ def test_kilopascals_taken_for_millibar_are_asked_about() -> None:
     here["pressure"] = 101300.0 - (101300.0 - here["pressure"]) / 10.0
     _, remarks = guessed(typed("gripper").data, read(here))
     assert any("where ejectors make 300 and more" in remark.text for remark in remarks)
+
+
+@pytest.mark.parametrize("factor", [10.0, 1000.0])
+def test_a_unit_of_measurement_that_changes_within_the_record_is_told_with_the_cycle(
+    factor: float,
+) -> None:
+    """As where two exports were joined: mbar and kPa, or mbar and bar, of a vacuum."""
+    here = samples_of(logged(SEED, KIND))
+    begins = np.flatnonzero(np.diff(here["commands"] & np.uint8(Command.SUCTION)) == 1) + 1
+    late = slice(int(begins[5]), None)
+    here["pressure"][late] = 101300.0 - (101300.0 - here["pressure"][late]) / factor
+    said = refused(here)
+    assert "its unit of measurement changes within the record" in said
+    assert re.search(r"from cycle [67] on", said)
 
 
 def test_a_record_of_two_units_is_refused_with_the_cycle() -> None:

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from twin.config import TABLES, Config
 from twin.errors import ConfigError, SourceError
+from twin.model import theta as theta_table
 from twin.model.dataset import DataSet, coefficients
 from twin.model.theta import COEFFICIENTS, MECHANISMS
 from twin.settings import Document, Settings
@@ -264,6 +265,8 @@ def test_every_coefficient_is_filled_in() -> None:
         "GAUGE",
         "SLOW_RAMP_UP",
         "EXHAUST_FOLLOWS",
+        "END_MOVES",
+        "MOVED",
         "FILTER_AT",
         "H1_FOLLOWS",
         "SLOW_SENSOR",
@@ -275,6 +278,12 @@ def test_every_coefficient_is_filled_in() -> None:
     mechanisms = set(list(COEFFICIENTS)[MECHANISMS:])
     blow_off = {"BLOW_OFF_SHAPE", "BLOW_OFF_DRAIN"}
     assert zero == blow_off | cups | opening | convection | effects | modes | mechanisms
+
+
+def test_each_coefficient_has_the_number_of_its_row() -> None:
+    """Of mechanisms only the first one has a name in the module."""
+    names = list(COEFFICIENTS)[:MECHANISMS]
+    assert [getattr(theta_table, name) for name in names] == [*range(MECHANISMS)]
 
 
 def test_the_hash_tells_data_sets_apart() -> None:

@@ -1,6 +1,7 @@
 """Check from the curves how pressure and commands are connected, before any fit."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NoReturn
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from twin.calibration.readings import Floats, Readings, stretches
 from twin.errors import ConfigError
 from twin.quality import UNUSABLE
-from twin.signals import MBAR, Samples
+from twin.signals import MBAR, Command, Samples
 
 NEVER_OPENED = 0.2  # of ambient pressure: a record below it was never at ambient
 TWICE = 1.5  # of ambient pressure: an idle above it counts ambient pressure twice
@@ -17,11 +18,14 @@ BELOW_NOTHING = -20.0 * MBAR  # Pa, absolute: lower than a slightly wrong ambien
 # its rise within an eighth of the time that nine tenths take.
 HELD = 0.25
 RISEN = 0.5  # of the vacuum: a smaller rise is no blow-off
+ANOTHER_UNIT = 6.0  # times the vacuum of the cycles before: mbar to kPa is 10, bar to psi is 14.5
+EACH = 2  # cycles at least in each of two units
 TAG = "[driver.tags.pressure], or of the column"
 
 
 def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> None:
     """ConfigError if the curves show another wiring; ``ambient`` (Pa) as configured."""
+    _refuse_two_units(samples)
     if readings.rises_in_suction:
         _refuse_rising(readings, ambient)
     if readings.deepest < BELOW_NOTHING:
@@ -50,6 +54,37 @@ def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> Non
         )
     if not readings.tells_blow_off:
         _refuse_missing_blow_off(samples)
+
+
+def _refuse_two_units(samples: Samples) -> None:
+    """ConfigError if the unit of measurement changes within the record: all cycles from one on."""
+    moves = np.array(_movements(samples))
+    for first in range(EACH, len(moves) - EACH + 1):
+        before, after = moves[:first], moves[first:]
+        larger = max(before.min() / after.max(), after.min() / before.max())
+        if larger > ANOTHER_UNIT:
+            middle = [f"{np.median(part) / MBAR:.3g}" for part in (before, after)]
+            raise ConfigError(
+                f"the pressure moves by {middle[0]} mbar in each cycle, and by {middle[1]} mbar"
+                f" from cycle {first + 1} on: its unit of measurement changes within the record",
+                f"give both parts the same unit, or commission on one part; check {TAG}",
+            )
+
+
+def _movements(samples: Samples) -> list[float]:
+    """Highest less lowest pressure (Pa) from each suction to the next; at least 1 Pa."""
+    pressure = samples["pressure"].astype(np.float64)
+    usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(pressure)
+    begins = [
+        stretch.first
+        for stretch in stretches(samples["commands"])
+        if stretch.command == Command.SUCTION
+    ]
+    cycles = [
+        pressure[first:last][usable[first:last]]
+        for first, last in pairwise([*begins, len(pressure)])
+    ]
+    return [max(float(np.ptp(cycle)), 1.0) for cycle in cycles if len(cycle)]
 
 
 def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:

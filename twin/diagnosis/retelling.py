@@ -154,6 +154,10 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     "the pressure idles at {idle} mbar absolute, and ambient pressure is {ambient}: it is absolute"
     " pressure, taken for gauge",
     'set reference = "absolute" of [driver.tags.pressure], or of the column',
+    "the pressure moves by {before} mbar in each cycle, and by {after} mbar from cycle {cycle} on:"
+    " its unit of measurement changes within the record",
+    "give both parts the same unit, or commission on one part; check [driver.tags.pressure], or of"
+    " the column",
     "the pressure moves by {size} mbar only in the whole record: no vacuum is made",
     "check the unit and the range of [driver.tags.pressure], or of the column",
     "the pressure rises to {highest} mbar absolute while suction is commanded, from about zero: it"
