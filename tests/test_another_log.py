@@ -272,6 +272,12 @@ def test_the_log_of_another_unit_is_refused_before_the_work(
     said = " ".join(capsys.readouterr().err.split())
     assert "b.mcap is a log of compact-ejector-35 gripper-02, not of" in said
     assert "cannot be judged on another" in said
+    with pytest.raises(
+        pytest.fail.Exception, match="it ran"
+    ):  # a person may say that it is the same
+        twin(
+            monkeypatch, "diagnose", folder / "one.mcap", "--judge-on", other, "--id", "gripper-01"
+        )
 
 
 def test_the_command_line_hands_on_what_the_other_log_says(

@@ -89,7 +89,7 @@ def diagnose(
     if other_log is not None and judge_on is not None:
         from twin.diagnosis.another_log import conditions
 
-        _refuse_another_asset(recorded.header, other_log.header, judge_on)
+        _refuse_another_asset(recorded.header, other_log.header, judge_on, unit)
         named = (str(log), recorded.header), (str(judge_on), other_log.header)
         there = conditions(settings, *named)
     with status() as say:
@@ -121,14 +121,17 @@ def diagnose(
         _propose(diagnosis, settings, log, propose)
 
 
-def _refuse_another_asset(header: "LogHeader", other: "LogHeader", log: Path) -> None:
-    """ConfigError if the log to judge on is of another asset."""
+def _refuse_another_asset(header: "LogHeader", other: "LogHeader", log: Path, unit: str) -> None:
+    """ConfigError if the log to judge on is of another asset; a person may name the ``unit``."""
+    if unit:
+        return
     own, others = ((one.asset_type, one.asset_id) for one in (header, other))
     if all((*own, *others)) and own != others:
         raise ConfigError(
             f"{log} is a log of {' '.join(others)}, not of {' '.join(own)}: a cause that was found"
             " on one unit cannot be judged on another",
-            "take another log of the same unit; twin effects add carries what was found to others",
+            "take another log of the same unit, or name it with --id if only its name differs;"
+            " twin effects add carries what was found to others",
         )
 
 
