@@ -152,7 +152,7 @@ def levels_and_time(evidence: Evidence) -> Floats:
 
     Shape (cycles, 3); NaN for what a cycle does not show.
     """
-    expected, healthy = evidence.seen(evidence.theta).levels, evidence.healthy.figures
+    expected, healthy = evidence.detected_switching(evidence.theta).levels, evidence.healthy.figures
     healthy_levels = [
         healthy.get(name) or Scatter(mean=level, sigma=UNSEEN_LEVEL_MBAR)
         for name, level in zip(LEVELS, expected, strict=True)

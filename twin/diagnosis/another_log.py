@@ -21,6 +21,7 @@ from twin.monitor.bins import Floats
 from twin.monitor.prediction_cache import LONGER, LONGER_MS
 from twin.signals import MS, NS, Command, Samples
 
+OF_A_ROW = 1.5  # rows by which a median may be off: commands are seen at the next row
 PHASES = 24  # of a rhythm that are tried on another log
 STRETCHES = ("suction", "blow-off", "idle")
 SUPPLY = ("supply", "pressure_bar")
@@ -121,6 +122,10 @@ def _with(data: DataSet, other: DataSet, changed: Collection[tuple[str, str]], l
             tables[table][key] = others[table][key]
         if tables["sensor"]["reference"] != "gauge":
             tables["ambient"] = data.ambient.model_dump()  # an absolute reading shows the weather
+        # A jet's ratios of pressures stay.
+        ratio = tables["ambient"]["pressure_mbar"] / data.ambient.pressure_mbar
+        for key in ("end_pressure_mbar", "suction_capacity_sl_min"):
+            tables["ejector"][key] *= ratio
         return DataSet.model_validate(tables)
     except ValidationError as error:
         raise ConfigError(
@@ -133,7 +138,8 @@ def _with(data: DataSet, other: DataSet, changed: Collection[tuple[str, str]], l
 def _other_program(diagnosis: Diagnosis, other: Evidence) -> str:
     """Why curves from data are left out on a log of another program; empty on the same program."""
     here, there = program(diagnosis.evidence), program(other)
-    differs = np.abs(there - here) > np.maximum(LONGER * here, LONGER_MS)
+    rows = max(_between_rows(diagnosis.evidence), _between_rows(other))
+    differs = np.abs(there - here) > np.maximum(LONGER * here, max(LONGER_MS, OF_A_ROW * rows))
     if not differs.any():
         return ""
     lasts = (
@@ -142,6 +148,11 @@ def _other_program(diagnosis: Diagnosis, other: Evidence) -> str:
         if differs[i]
     )
     return f"the curve from data, which holds for its program of commands only: {', '.join(lasts)}"
+
+
+def _between_rows(evidence: Evidence) -> float:
+    """Median time (ms) from row to row."""
+    return float(np.median(np.diff(evidence.samples["time_ns"]))) * NS / MS
 
 
 def program(evidence: Evidence) -> Floats:

@@ -29,11 +29,13 @@ from twin.signals import MBAR, Phase
 GROUPS, FEWEST = 8, 4  # of the driver's values; bins of held-out cycles in one
 POINTS = 60  # of the law
 PROBE = 0.2  # of the size: the step of a derivative
+UNSEEN = 1e-9  # of the clearest dot's information: a dot with less is not seen at all
+LEAST_END = 1.0  # mbar of vacuum at which a relay ends at least, as in the model
 SUREST = 0.7  # of the size: one sigma of a dot that still says something
 
 
 @dataclass(frozen=True)
-class DetectedSwitching:
+class RefittedSize:
     """A size over its driver, by law and as held-out cycles show it, in the size's unit."""
 
     parameter: str
@@ -64,7 +66,7 @@ class Inferred:
     x: Floats  # of each bin; NaN where the mechanism is not driven
     share: Floats
     levels: tuple[float, float] | None  # mbar, where it begins and ends, of a relay
-    sizes: tuple[DetectedSwitching, ...]
+    sizes: tuple[RefittedSize, ...]
 
     @property
     def agreeing(self) -> tuple[int, int]:
@@ -104,9 +106,9 @@ def inferred(diagnosed: Found) -> Inferred:
         y = in_law * value + more
         names = parameter.name, parameter.unit, word
         arrays = (part[shown] for part in (middle, in_law, y, sigma))
-        sizes.append(DetectedSwitching(*names, value, low, high, *arrays))
+        sizes.append(RefittedSize(*names, value, low, high, *arrays))
     begins = cause.values.get("begins", 0.0)
-    relay = (begins, begins - cause.values["ends_below"]) if is_relay else None
+    relay = (begins, max(begins - cause.values["ends_below"], LEAST_END)) if is_relay else None
     return Inferred(mechanism, label, x, share, relay, tuple(sizes))
 
 
@@ -134,8 +136,11 @@ def _refitted(
     level = levels(evidence, weights.cycles, [hypothesis])
     white = weights.white(off, np.repeat(level, len(masks), axis=1))
     residual, response = white[:, 0], white[:, 1:] - white[:, :1]
-    inverse = np.linalg.pinv(response.T @ response)
-    more = -inverse @ response.T @ residual
+    normal = response.T @ response
+    unseen = np.diag(normal) <= UNSEEN * np.diag(normal).max(initial=0.0)
+    inverse = np.linalg.pinv(normal)
+    inverse[unseen, unseen] = np.inf
+    more = np.where(unseen, 0.0, -np.linalg.pinv(normal) @ response.T @ residual)
     left = residual + response @ more
     scale = max(float(left @ left) / max(len(left) - len(more), 1), 1.0)
     return more, np.sqrt(np.diag(inverse) * scale)

@@ -339,10 +339,11 @@ class DataSet(Settings):
             for nozzle in (before, after)
         ]
         ambient = self.ambient.pressure_mbar * MBAR / BAR
-        rises = 1.0 + ejector.end_follows_supply * supply.end_pressure_slope * drop
+        follows = ejector.end_follows_supply if drop > 0.0 else 1.0  # of a lower supply
+        rises = max(1.0 + follows * supply.end_pressure_slope * drop, LEAST_SHARE)
         tables = self.model_dump()
         tables["supply"]["pressure_bar"] = pressure_bar
-        tables["supply"]["end_pressure_slope"] /= max(rises, LEAST_SHARE)
+        tables["supply"]["end_pressure_slope"] /= rises
         tables["ejector"]["suction_capacity_sl_min"] *= peaks[1] / max(peaks[0], LEAST_SHARE)
         tables["ejector"]["end_pressure_mbar"] *= rises
         tables["ejector"]["blow_off_sl_min"] *= (after + ambient) / (before + ambient)

@@ -59,7 +59,8 @@ def expected_detector(theta: Theta, noise: float, period: float = MS) -> Detecto
     for _ in range(ROUNDS):
         rows = max(sharp, sharp * (ROUNDED / SHARP * (1.0 + lag / rows)) ** (2.0 / 3.0))
     window = int(min(max(math.ceil(rows), SHORTEST_WINDOW), LONGEST_WINDOW))
-    above_the_end = theta[c.AMBIENT] - theta[c.H1] - theta[c.END_RATIO] * theta[c.AMBIENT]
+    end = theta[c.END_RATIO] * theta[c.AMBIENT] + theta[c.MOVED]
+    above_the_end = theta[c.AMBIENT] - theta[c.H1] - end
     to_the_end = above_the_end / bend  # at this slope
     at_once = DetectorSettings(
         window=window,
