@@ -64,6 +64,17 @@ def test_ambient_pressure_says_where_it_is_from(
     assert shown(found)["ambient"].source == source
 
 
+@pytest.mark.parametrize(("barometer", "source"), [(np.nan, "assumed"), (100_500.0, "barometer")])
+def test_a_sensor_that_counts_from_ambient_does_not_show_it(barometer: float, source: str) -> None:
+    """Its idle is the configured ambient pressure, whatever the weather."""
+    found = read(opened=True, barometer=barometer, idle=100_000.0)
+    fitted = found.calibration.fitted
+    sensor = fitted.data.sensor.model_copy(update={"reference": "gauge"})
+    fitted = replace(fitted, data=fitted.data.model_copy(update={"sensor": sensor}))
+    found = replace(found, calibration=replace(found.calibration, fitted=fitted))
+    assert shown(found)["ambient"].source == source
+
+
 def test_ambient_pressure_may_be_that_of_the_fit() -> None:
     found = read(opened=False, barometer=np.nan)
     fitted = found.calibration.fitted

@@ -79,8 +79,14 @@ def read_off(commissioned: Commissioned) -> Iterator[ReadOff]:
 
 
 def _ambient_from(commissioned: Commissioned) -> str:
-    """The source of ambient pressure; a barometer that contradicts the idle is not used."""
+    """The source of ambient pressure; a barometer that contradicts the idle is not used.
+
+    A sensor that counts from ambient shows none: without a barometer its idle is the configured
+    ambient pressure.
+    """
     readings, fitted = commissioned.readings, commissioned.calibration.fitted
+    if fitted.data.sensor.reference == "gauge" and not np.isfinite(readings.barometer):
+        return "assumed"
     if readings.opened and not abs(readings.idle - readings.barometer) <= APART:
         return "idle"
     if np.isfinite(readings.barometer):
