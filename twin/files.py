@@ -19,6 +19,7 @@ from twin.errors import ConfigError, SourceError
 
 MOST_DEEP = 20  # levels of a JSON document; an answer of a diagnosis has eight
 LONGEST_BITS = 64  # of an integer in JSON; Python refuses to print very long ones
+REPLACE = "choose another name, or replace it with --force"
 MEMORY_BUDGET = 64 << 20  # bytes; no valid record, batch of rows or package comes near it
 
 
@@ -50,13 +51,13 @@ def require_writable(*paths: Path | None) -> None:
             raise _unwritable(path, "no folder to write to")
 
 
-def refuse_existing(path: Path, *, force: bool = False) -> None:
-    """SourceError if a file with data or settings would be replaced without ``--force``."""
+def refuse_existing(path: Path, *, force: bool = False, hint: str = REPLACE) -> None:
+    """SourceError if a file with data or settings would be replaced without ``--force``.
+
+    A command without that option gives its own ``hint``.
+    """
     if path.exists() and not force:
-        raise SourceError(
-            f"{path}: there is already a file of that name",
-            "choose another name, or replace it with --force",
-        )
+        raise SourceError(f"{path}: there is already a file of that name", hint)
 
 
 def require_ending(path: Path, *endings: str) -> str:

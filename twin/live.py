@@ -162,14 +162,13 @@ def closing_all(sinks: Sequence[Sink], advisers: Sequence[EventEnricher]) -> Ite
 def dispatch_unmodelled(sinks: Sequence[Sink], blocks: Iterable[Samples], why: str) -> int:
     """Give the sinks rows that the model has not seen; returns how many.
 
-    Their expected pressure is NaN, and with ``why`` an event goes with the first of them.
+    Their expected pressure is NaN, and with ``why`` an event goes with the first of them. Empty
+    blocks go to the sinks too: a log writes what it holds while no rows come.
     """
     count = 0
     for samples in blocks:
-        if not len(samples):
-            continue
-        time_ns = int(samples["time_ns"][0])
-        events = [Event(time_ns, Kind.NO_MODEL, why)] if why and not count else []
+        is_first = len(samples) > 0 and not count
+        events = [Event(int(samples["time_ns"][0]), Kind.NO_MODEL, why)] if why and is_first else []
         dispatch(sinks, samples, _unmodelled(samples), events)
         count += len(samples)
     return count

@@ -152,15 +152,12 @@ def _recorded(
     source: Path, config: Path | None, assets: str, unit: str, cycles: int, log: Path | None
 ) -> Path:
     """Record the cycles of a PLC; gives their log. What is wrong otherwise is said before."""
-    from twin.cli.recording import log_beside, record_cycles
+    from twin.cli.recording import new_log, record_cycles
     from twin.config import Config
-    from twin.files import refuse_existing
     from twin.settings import Document
 
     document = Document.read(config or source)
     settings = _named(Config.of(document, assets, unit, calibrated=False))
-    log = log or log_beside(source, settings.asset.id)
-    require_writable(log)
-    refuse_existing(log)
+    log = new_log(log, source, settings.asset.id)
     record_cycles(settings, cycles, log)
     return log
