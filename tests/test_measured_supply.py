@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from second_world.draw import draw_rig
 from second_world.faults import Fault
 from second_world.records import record
 
-from twin.calibration.calibrate import calibrate
-from twin.calibration.commission import as_gauged, commission
+from twin.calibration.calibrate import as_gauged, calibrate, limited
+from twin.calibration.commission import commission
+from twin.calibration.page import calibration_summary
+from twin.calibration.report import as_json, in_words
+from twin.calibration.save import record_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import Evidence, collect
@@ -22,7 +26,7 @@ from twin.inference.priors import FARTHEST, by_gauge
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet
 from twin.monitor.measured_supply import at_rest, supplied
-from twin.signals import BAR, Samples
+from twin.signals import BAR, Command, Samples
 
 SECOND = (80005, 80033, 80040)  # a gripper, a tank without air saving, a closed tank
 
@@ -62,6 +66,35 @@ def test_the_supply_at_rest_goes_into_the_data_set(name: str) -> None:
     assert supplied(data, blind(samples)) == data
 
 
+def constant(samples: Samples, bar: float) -> Samples:
+    """The same with a PLC that gives a constant in place of a gauge."""
+    changed = samples.copy()
+    changed["supply"] = np.float32(bar * BAR)
+    return changed
+
+
+def test_a_constant_is_no_gauge() -> None:
+    samples = log_of("gripper")
+    assert supplied(typed("gripper").data, constant(samples, 6.0)) == typed("gripper").data
+    assert "supply" in limited(typed("gripper").data, samples)
+    assert "supply" not in limited(typed("gripper").data, constant(samples, 5.0))
+
+
+def test_a_gauge_behind_the_valve_is_remembered_with_the_nozzle_on_alone() -> None:
+    data, behind = typed("gripper").data, log_of("gripper").copy()
+    behind["supply"][behind["commands"] != Command.SUCTION] *= np.float32(0.001)
+    assert supplied(data, behind) == data
+    assert limited(data, behind)["supply"].mean == pytest.approx(4.8, abs=0.05)
+
+
+def test_what_is_lost_before_the_nozzle_stays_below_the_supply() -> None:
+    """Both to 0.05 bar: what no data set may have is not made of a reading that is a bit more."""
+    data = DataSet.model_validate({"supply": {"pressure_bar": 5.0, "droop_bar": 1.0}})
+    low = fed(log_of("gripper"), at_rest(log_of("gripper")) - 1.02)
+    assert at_rest(low) == pytest.approx(1.02)
+    assert supplied(data, low) == data
+
+
 def test_an_optimum_that_nobody_configured_follows_the_gauge() -> None:
     data = DataSet.model_validate({"supply": {"pressure_bar": 5.0, "curvature": 2.0}})
     supply = supplied(data, fed(log_of("gripper"), 0.5)).supply
@@ -99,9 +132,25 @@ def test_a_calibration_remembers_what_the_gauge_read() -> None:
     lower = calibrate(config, [samples], quiet)
     assert lower.fitted.data.supply.pressure_bar == 4.5
     assert lower.healthy.key_figures["supply"].mean == pytest.approx(found.mean - 0.5, abs=0.01)
+    assert [remark.line for remark in lower.remarks] == ["[data.supply] pressure_bar = 4.5"]
     without = calibrate(config, [blind(log_of("gripper"))], quiet)
     assert "supply" not in without.healthy.key_figures
     assert without.fitted.data.supply.pressure_bar == 5.0
+    assert without.remarks == calibrated("gripper").remarks == ()
+
+
+def test_a_calibration_says_what_the_gauge_corrected(tmp_path: Path) -> None:
+    """On terminal, page and for programs."""
+    _, (remark,) = as_gauged(typed("gripper").data, fed(log_of("gripper"), 0.5))
+    found, unit = replace(calibrated("gripper"), remarks=(remark,)), typed("gripper")
+    for line in (remark.text, remark.line):
+        assert line in in_words(found)
+        assert line not in in_words(calibrated("gripper"))
+    assert "The supply reads 4.5 bar" in calibration_summary(found, unit.asset, log_of("gripper"))
+    log = tmp_path / "log.mcap"
+    log.write_bytes(b"a log")
+    contradicts = as_json(found, record_of(found, unit, log))["contradicts"]
+    assert contradicts == [{"what": remark.text, "line": remark.line}]
 
 
 # --- a diagnosis ----------------------------------------------------------------------------------
@@ -139,6 +188,12 @@ def test_it_counts_as_one_reading_however_long_the_log_is() -> None:
     assert priced(healthy(), leak) == 0.0
     lower = replace(healthy(), samples=fed(healthy().samples, 0.3))
     assert priced(lower, drop) == pytest.approx(-9.0, abs=1.0)
+
+
+def test_a_constant_speaks_against_nothing() -> None:
+    """As of a gauge that has got stuck, or of a PLC's program that is another by now."""
+    stuck = replace(healthy(), samples=constant(healthy().samples, 4.8))
+    assert priced(stuck, Cause("supply_pressure_drop", {"drop": 0.6})) == 0.0
 
 
 def test_a_drop_within_the_log_is_compared_cycle_by_cycle() -> None:

@@ -19,6 +19,7 @@ from twin.calibration.calibrate import calibrate
 from twin.calibration.commission import commission, guessed
 from twin.calibration.readings import read
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
+from twin.cli.setup import pair_of
 from twin.config import Asset
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.report import in_words
@@ -26,8 +27,10 @@ from twin.errors import ConfigError
 from twin.events import Event, Kind
 from twin.live import run
 from twin.monitor.cycles import Cycle, whole
+from twin.monitor.healthy import Scatter
 from twin.monitor.signal_checks import ReportWatch, check, standing
-from twin.signals import BAR, MBAR, Command, Reported, Samples
+from twin.quality import Quality
+from twin.signals import BAR, MBAR, Command, Phase, Reported, Samples
 
 TAGS = {"nozzle", "part_present", "pressure_2", "flow", "supply"}
 OPENED = TAGS | {"ambient"}
@@ -61,12 +64,12 @@ def cycles(name: str, samples: Samples) -> Sequence[Cycle]:
     return found
 
 
-def told(name: str, samples: Samples) -> dict[str, str]:
-    """What each signal that contradicts says."""
+def told(name: str, samples: Samples, *, gauged: bool = True) -> dict[str, str]:
+    """What each signal that contradicts says; with ``gauged`` the unit's supply was measured."""
     detector, theta = rigs.detector(name), rigs.theta(name)
     return {
         contradiction.signal: contradiction.what
-        for contradiction in standing(cycles(name, samples), theta, detector)
+        for contradiction in standing(cycles(name, samples), theta, detector, gauged=gauged)
     }
 
 
@@ -74,7 +77,8 @@ def told(name: str, samples: Samples) -> dict[str, str]:
 @pytest.mark.parametrize("late_ms", [0.0, 20.0])
 def test_what_is_right_agrees_in_every_cycle(name: str, tags: set[str], late_ms: float) -> None:
     for cycle in cycles(name, simulated(name, late_ms)):
-        assert check(cycle, rigs.theta(name), rigs.detector(name)) == dict.fromkeys(tags)
+        outcomes = check(cycle, rigs.theta(name), rigs.detector(name), gauged=True)
+        assert outcomes == dict.fromkeys(tags)
 
 
 @pytest.mark.parametrize("name", ["test_rig", "gripper"])
@@ -175,6 +179,55 @@ def test_a_signal_that_is_wrong_is_told_of_alone(
 
 
 @pytest.mark.parametrize("name", ["test_rig", "gripper"])
+def test_a_gauge_is_compared_with_a_supply_that_was_measured_alone(name: str) -> None:
+    """A data set without a gauge has what somebody wrote down: a right gauge may read another."""
+    assert told(name, changed(simulated(name), gauge_lower), gauged=False) == {}
+    scaled = changed(simulated(name), gauge_in_another_unit)
+    assert set(told(name, scaled, gauged=False)) == {"supply"}
+
+
+@pytest.mark.parametrize("bar", [0.0, 5.0, 6.0])
+def test_a_constant_is_no_gauge(bar: float) -> None:
+    def constant(samples: Samples) -> None:
+        samples["supply"] = np.float32(bar * BAR)
+
+    for cycle in cycles("gripper", changed(simulated("gripper"), constant)):
+        outcomes = check(cycle, rigs.theta("gripper"), rigs.detector("gripper"), gauged=True)
+        assert set(outcomes) == OPENED - {"supply"}
+
+
+def test_a_gauge_between_valve_and_nozzle_reads_nothing_at_rest() -> None:
+    for cycle in cycles("gripper", simulated("gripper")):
+        samples = cycle.samples.copy()
+        samples["supply"][cycle.ticks["phase"] != Phase.SUCTION] *= np.float32(0.001)
+        behind = replace(cycle, samples=samples)
+        outcomes = check(behind, rigs.theta("gripper"), rigs.detector("gripper"), gauged=True)
+        assert outcomes == dict.fromkeys(OPENED)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_cycle_without_a_usable_pressure_contradicts_no_gauge() -> None:
+    cycle = cycles("gripper", changed(simulated("gripper"), gauge_in_another_unit))[1]
+    samples = cycle.samples.copy()
+    samples["quality"] |= np.uint8(Quality.OVERFLOW)
+    samples["reported"] = 0
+    lost = replace(cycle, samples=samples)
+    outcomes = check(lost, rigs.theta("gripper"), rigs.detector("gripper"), gauged=True)
+    assert outcomes.get("supply") is None
+
+
+def test_the_loop_knows_whether_the_units_supply_was_measured() -> None:
+    config = rigs.config("gripper")
+    scatter = {"supply": Scatter(mean=4.8, sigma=0.1)}
+    healthy = config.monitor.healthy.model_copy(update={"key_figures": scatter})
+    monitor = config.monitor.model_copy(update={"healthy": healthy})
+    for settings, gauged in ((config, False), (replace(config, monitor=monitor), True)):
+        _, watching = pair_of(settings)
+        assert watching.reports
+        assert watching.reports.gauged is gauged
+
+
+@pytest.mark.parametrize("name", ["test_rig", "gripper"])
 def test_another_h2_than_configured_is_told_with_its_value(name: str) -> None:
     found = told(name, simulated(name, h2_mbar=450.0))
     assert set(found) == {"part_present"}
@@ -266,9 +319,9 @@ def test_a_calibration_refuses_what_contradicts() -> None:
 
 @pytest.mark.slow
 def test_a_diagnosis_tells_it_beside_its_answer() -> None:
-    diagnosis = diagnose(
-        rigs.config("test_rig"), [changed(simulated("test_rig"), reversed_flow)], "log", quiet
-    )
+    samples = changed(simulated("test_rig"), reversed_flow)
+    gauge_lower(samples)  # nothing to compare with: the unit was calibrated without
+    diagnosis = diagnose(rigs.config("test_rig"), [samples], "log", quiet)
     (one,) = diagnosis.json["signals"]
     assert one["signal"] == "flow"
     assert f"flow           {one['what']}" in in_words(diagnosis)

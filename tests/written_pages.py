@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 from calibrations import log_of, typed
 
-from twin.calibration.calibrate import Calibration
-from twin.calibration.commission import Commissioned, Remark
+from twin.calibration.calibrate import Calibration, Remark
+from twin.calibration.commission import Commissioned
 from twin.calibration.fit import Fitted
 from twin.calibration.parameters import FREE
 from twin.calibration.readings import read

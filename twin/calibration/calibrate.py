@@ -26,7 +26,7 @@ from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.cycles import Cycle, figures, whole
 from twin.monitor.detector_window import select_window
 from twin.monitor.healthy import Healthy, Scatter, sure
-from twin.monitor.measured_supply import SUPPLY, supplied
+from twin.monitor.measured_supply import SUPPLY, is_gauge, supplied
 from twin.monitor.signal_checks import Contradiction, standing
 from twin.monitor.surroundings import taken_in
 from twin.quality import BREAK, UNUSABLE
@@ -38,6 +38,17 @@ MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
 MOST_LEFT = 15.0  # mbar rms: a larger residual means that the log is not of such an ejector
 LEAST_SCATTER = 0.05  # of a figure, in its unit
 NOTHING: Mapping[str, float] = MappingProxyType({})
+# bar: the supply is reported if it differs by more from the configuration; gauges and regulators
+# scatter by half of it.
+SUPPLY_CLEARLY = 0.2
+
+
+@dataclass(frozen=True)
+class Remark:
+    """A contradiction of record and configuration, with the line to change."""
+
+    text: str
+    line: str
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,7 @@ class Calibration:
     cycles: int
     first_ns: int  # host time of the log's first and last row
     last_ns: int
+    remarks: tuple[Remark, ...] = ()  # corrections that the record made; Commissioned has its own
 
 
 def calibrate(
@@ -61,7 +73,8 @@ def calibrate(
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    config = replace(config, data=taken_in(supplied(config.data, samples), samples))
+    gauged, remarks = as_gauged(config.data, samples)
+    config = replace(config, data=taken_in(gauged, samples))
     before = complete(config.data, samples)
     refuse_insufficient(samples, before, "calibration")
     refuse_contradicting(before, config.data)
@@ -77,7 +90,18 @@ def calibrate(
     verdict = judge(Cycles.found(samples[used], fitted.data), fitted.data, read(samples).noise)
     healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
-    return Calibration(fitted, verdict, healthy, len(cycles), int(times[0]), int(times[-1]))
+    ends = int(times[0]), int(times[-1])
+    return Calibration(fitted, verdict, healthy, len(cycles), *ends, tuple(remarks))
+
+
+def as_gauged(data: DataSet, samples: Samples) -> tuple[DataSet, list[Remark]]:
+    """``data`` with the supply pressure that a gauge shows at rest, if there is one."""
+    gauged = supplied(data, samples)
+    measured, configured = gauged.supply.pressure_bar, data.supply.pressure_bar
+    if abs(measured - configured) <= SUPPLY_CLEARLY:
+        return gauged, []
+    text = f"the supply reads {measured:g} bar; the configuration says {configured:g}"
+    return gauged, [Remark(text, f"[data.supply] pressure_bar = {measured:g}")]
 
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:
@@ -227,11 +251,11 @@ def rounding(data: DataSet, samples: Samples) -> float:
 def limited(data: DataSet, samples: Samples) -> dict[str, Scatter]:
     """Scatter of a healthy record's limited key figures that at least FEWEST cycles have.
 
-    The supply is among them: what a gauge reads later is compared with it.
+    A measured supply is among them: what a gauge reads later is compared with it.
     """
     key_figures = KeyFigures(data)
     told_cycles = [*filter(None, map(key_figures.take, whole(Twin.of(data).over([samples]))))]
-    names = (*LIMITED, SUPPLY)
+    names = (*LIMITED, SUPPLY) if is_gauge(samples) else LIMITED
     by_name = {name: np.array([cycle.measured[name] for cycle in told_cycles]) for name in names}
     by_name = {name: values[np.isfinite(values)] for name, values in by_name.items()}
     return {name: _scatter(values) for name, values in by_name.items() if len(values) >= FEWEST}

@@ -16,6 +16,8 @@ from pydantic import ValidationError
 from twin.calibration.calibrate import (
     MOST_FITTED,
     Calibration,
+    Remark,
+    as_gauged,
     complete,
     contradictions,
     like_these,
@@ -42,7 +44,6 @@ from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
 from twin.monitor.cycles import FEWEST_ROWS, Cycle
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy
-from twin.monitor.measured_supply import supplied
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
@@ -88,7 +89,6 @@ DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at wh
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
 LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar: ambient pressure is reported if it differs by more
-SUPPLY_CLEARLY = 0.2  # bar: the same for the supply; gauges and regulators scatter by half of it
 # Relative difference from the configured volume above which that of the flow meter is used: nearly
 # twice a flow meter's error on rigs whose truth is known.
 VOLUME_CLEARLY = 0.15
@@ -100,14 +100,6 @@ OPTIMUM_UNTOLD = 0.2
 # market have 10 to 300.
 HYSTERESIS_UNTOLD = 75.0
 LEAST_OFFSET = 1.0  # mbar: a smaller difference from the barometer is no offset of the sensor
-
-
-@dataclass(frozen=True)
-class Remark:
-    """A contradiction of record and configuration, with the line to change."""
-
-    text: str
-    line: str
 
 
 @dataclass(frozen=True)
@@ -389,16 +381,6 @@ def switching_as(guess: DataSet, data: DataSet) -> DataSet:
     """``data`` with the thresholds of ``guess``."""
     thresholds = {key: getattr(guess.ejector, key) for key in _THRESHOLDS}
     return data.model_copy(update={"ejector": data.ejector.model_copy(update=thresholds)})
-
-
-def as_gauged(data: DataSet, samples: Samples) -> tuple[DataSet, list[Remark]]:
-    """``data`` with the supply pressure that a gauge shows at rest, if there is one."""
-    gauged = supplied(data, samples)
-    measured, configured = gauged.supply.pressure_bar, data.supply.pressure_bar
-    if abs(measured - configured) <= SUPPLY_CLEARLY:
-        return gauged, []
-    text = f"the supply reads {measured:g} bar; the configuration says {configured:g}"
-    return gauged, [Remark(text, f"[data.supply] pressure_bar = {measured:g}")]
 
 
 def as_metered(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:

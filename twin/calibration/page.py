@@ -1,10 +1,10 @@
 """The page of a commissioning: verdict, what to change, measured against fitted, values."""
 
 import html
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from twin.calibration.calibrate import Calibration
+from twin.calibration.calibrate import Calibration, Remark
 from twin.calibration.commission import Commissioned
 from twin.calibration.picture import draw_fit
 from twin.calibration.read_off import read_off
@@ -42,7 +42,8 @@ def calibration_summary(calibration: Calibration, asset: Asset, samples: Samples
     title = f"{asset.type} {asset.id}: {calibration_headline(calibration)}"
     picture = draw_fit(calibration.fitted.data, samples)
     verdict = page.paragraph(f"{capital(calibration_verdict(calibration.verdict))}.")
-    parts = [verdict, _residuals(calibration.verdict), _parameters(calibration)]
+    corrections = _corrections(calibration.remarks)
+    parts = [verdict, *corrections, _residuals(calibration.verdict), _parameters(calibration)]
     return page.summary(title, parts, picture)
 
 
@@ -89,9 +90,7 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
     for doubt in commissioned.doubts:
         what = tr("Is the unit healthy? {what}", what=capital(retold(doubt.text)))
         yield page.box(what, f"{capital(retold(doubt.action))}.")
-    for remark in commissioned.remarks:
-        advice = tr("The record's value is used. Write: {line}", line=retold(remark.line))
-        yield page.box(capital(retold(remark.text)), advice)
+    yield from _corrections(commissioned.remarks)
     for contradiction in commissioned.contradictions:
         action = capital(retold(contradiction.action))
         yield page.box(capital(retold(contradiction.what)), f"{action}.")
@@ -103,6 +102,12 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
         )
     if commissioned.unseen:
         yield page.paragraph(f"{capital(commissioned.unseen)}.")
+
+
+def _corrections(remarks: Sequence[Remark]) -> Iterator[str]:
+    for remark in remarks:
+        advice = tr("The record's value is used. Write: {line}", line=retold(remark.line))
+        yield page.box(capital(retold(remark.text)), advice)
 
 
 def _residuals(verdict: Verdict) -> str:

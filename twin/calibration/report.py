@@ -1,9 +1,10 @@
 """Results of a calibration, for people and for programs."""
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from twin.assets.record import Record
-from twin.calibration.calibrate import Calibration
+from twin.calibration.calibrate import Calibration, Remark
 from twin.calibration.commission import Commissioned
 from twin.calibration.read_off import read_off
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
@@ -22,12 +23,20 @@ def in_words(calibration: Calibration) -> str:
     lines = [
         calibration_headline(calibration),
         calibration_verdict(calibration.verdict),
+        *_corrections(calibration.remarks),
         "",
         *_residuals(calibration.verdict),
         "",
         _values(calibration),
     ]
     return "\n".join(lines)
+
+
+def _corrections(remarks: Sequence[Remark]) -> Iterator[str]:
+    """What the record corrected, each with the line to write."""
+    for remark in remarks:
+        yield from ("", f"the record contradicts the configuration: {remark.text}")
+        yield f"  the record's value is used; write: {remark.line}"
 
 
 def _residuals(verdict: Verdict) -> list[str]:
@@ -96,10 +105,16 @@ def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
         "left_mbar": calibration.fitted.left / MBAR,
         "verdict": calibration_word(calibration.verdict),
         "residual": residuals_as_json(calibration.verdict),
+        "contradicts": _contradicts(calibration.remarks),
         "parameters": parameters(calibration),
         "healthy": dict(record.healthy),
         "data": dict(record.data),
     }
+
+
+def _contradicts(remarks: Sequence[Remark]) -> list[dict[str, str]]:
+    """For programs, what the record corrected."""
+    return [{"what": remark.text, "line": remark.line} for remark in remarks]
 
 
 def residuals_as_json(verdict: Verdict) -> dict[str, dict[str, float]]:
@@ -140,9 +155,7 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
         lines += ["", to_check()]
     for doubt in commissioned.doubts:
         lines += ["", f"is the unit healthy? {doubt.text}", f"  {doubt.action}"]
-    for remark in commissioned.remarks:
-        lines += ["", f"the record contradicts the configuration: {remark.text}"]
-        lines += [f"  the record's value is used; write: {remark.line}"]
+    lines += _corrections(commissioned.remarks)
     for contradiction in commissioned.contradictions:
         lines += [
             "",
@@ -235,9 +248,7 @@ def commissioned_as_json(
         "verdict": commissioned.verdict.word,
         **_refused_because(commissioned.verdict),
         "residual": residuals_as_json(commissioned.verdict),
-        "contradicts": [
-            {"what": remark.text, "line": remark.line} for remark in commissioned.remarks
-        ],
+        "contradicts": _contradicts(commissioned.remarks),
         "doubts": [{"what": doubt.text, "do": doubt.action} for doubt in commissioned.doubts],
         "signals": [
             {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}

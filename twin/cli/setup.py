@@ -76,6 +76,7 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     """The twin of a configuration and its monitor; with ``judges`` it evaluates cycles."""
     from twin.live import compiled
     from twin.monitor.isolation import Isolation
+    from twin.monitor.measured_supply import is_known
     from twin.monitor.monitor import Monitor
     from twin.monitor.signal_checks import ReportWatch
 
@@ -91,7 +92,8 @@ def pair_of(settings: "Config", *, judges: bool = True) -> tuple["Twin", "Monito
     monitor = Monitor(
         watch, twin.theta, key_figure_source=key_figure_source, isolation=isolation, judges=judges
     )
-    monitor.reports = ReportWatch(twin.theta, twin.detector) if judges else None
+    gauged = is_known(watch.healthy)
+    monitor.reports = ReportWatch(twin.theta, twin.detector, gauged) if judges else None
     if settings.document.tables.get("driver", {}).get("mode") == "poll":
         monitor.clocks = None  # then times are this machine's
     return twin, monitor

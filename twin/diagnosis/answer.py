@@ -39,6 +39,7 @@ from twin.model.term import Term
 from twin.monitor.bins import Floats, Ints
 from twin.monitor.cycles import Cycle
 from twin.monitor.healthy import NOT_COMMISSIONED
+from twin.monitor.measured_supply import is_known
 from twin.monitor.signal_checks import standing
 from twin.signals import Samples
 
@@ -291,7 +292,8 @@ def _term_found(
 def _signals(log: LogCycles) -> list[dict[str, str]]:
     """Reported or measured signals that contradict the pressure."""
     cycles = (Cycle(number, *log.rows(number), complete=True) for number in range(log.cycles))
-    contradictions = standing(cycles, log.base.theta, log.base.detector)
+    gauged = is_known(log.base.healthy)
+    contradictions = standing(cycles, log.base.theta, log.base.detector, gauged=gauged)
     return [
         {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
         for contradiction in contradictions

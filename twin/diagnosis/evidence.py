@@ -35,7 +35,7 @@ from twin.monitor.bins import Bins, Floats, Ints, binned
 from twin.monitor.cycles import cut, figures
 from twin.monitor.detector_window import detector_of, select_window
 from twin.monitor.healthy import Healthy
-from twin.monitor.measured_supply import lower_by
+from twin.monitor.measured_supply import is_gauge, lower_by
 from twin.monitor.rows import drawn_rows, time_steps
 from twin.monitor.scatter_covariance import least_time_ms
 from twin.monitor.simulated_switching import DetectedSwitching, detected_switching
@@ -160,6 +160,8 @@ class Evidence:
 
         NaN without a gauge, here or in the healthy cycles.
         """
+        if not is_gauge(self.samples):
+            return np.full(len(self.starts) - 1, np.nan)
         parts = [slice(first, last) for first, last in pairwise(self.starts.tolist())]
         return np.array(
             [lower_by(self.healthy, self.samples[part], self.ticks[part]) for part in parts]

@@ -8,6 +8,7 @@ gauge at the same place, so its offset cancels out, and so does what is lost bef
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from twin.model.dataset import DataSet, Supply
 from twin.monitor.healthy import Healthy
@@ -19,6 +20,8 @@ SUPPLY = "supply"  # the key figure: mean supply pressure (bar gauge) while the 
 LEAST, MOST = 0.9, 10.0
 STEP = 0.05  # bar; a gauge is not more exact
 
+Floats = npt.NDArray[np.float64]
+
 
 def lower_by(healthy: Healthy, samples: Samples, ticks: Ticks) -> float:
     """How much less (bar) the gauge reads with the nozzle on than in healthy cycles.
@@ -28,9 +31,29 @@ def lower_by(healthy: Healthy, samples: Samples, ticks: Ticks) -> float:
     usual = healthy.key_figures.get(SUPPLY)
     if usual is None:
         return math.nan
-    readings = samples["supply"][ticks["phase"] == Phase.SUCTION].astype(np.float64)
-    readings = readings[np.isfinite(readings)]
-    return usual.mean - float(np.mean(readings)) / BAR if len(readings) else math.nan
+    readings = with_nozzle_on(samples, ticks)
+    return usual.mean - float(np.mean(readings)) if len(readings) else math.nan
+
+
+def is_gauge(samples: Samples) -> bool:
+    """Whether the supply is measured: a PLC that has no gauge may give a constant instead.
+
+    A gauge that reads the same to the bit over all rows cannot be told from a constant.
+    """
+    readings = samples["supply"][np.isfinite(samples["supply"])]
+    return bool((readings != readings[:1]).any())
+
+
+def is_known(healthy: Healthy) -> bool:
+    """Whether there was a gauge when the unit was calibrated: its data set has what that read."""
+    return SUPPLY in healthy.key_figures
+
+
+def with_nozzle_on(samples: Samples, ticks: Ticks) -> Floats:
+    """Readings (bar gauge) while the nozzle was on; empty if it is not measured."""
+    readings = samples["supply"][ticks["phase"] == Phase.SUCTION].astype(np.float64) / BAR
+    measured: Floats = readings[np.isfinite(readings)]
+    return measured
 
 
 def at_rest(samples: Samples) -> float:
@@ -49,11 +72,13 @@ def supplied(data: DataSet, samples: Samples) -> DataSet:
     """A data set with the supply pressure that a record has measured at rest, to 0.05 bar.
 
     An optimum that nobody configured follows, as it would from the configuration. Without a gauge,
-    or with one that cannot be right, it is ``data`` itself.
+    or with one that cannot be right at rest, it is ``data`` itself.
     """
     measured = at_rest(samples)
-    if not is_possible(measured) or measured <= data.supply.droop_bar:
+    if not is_gauge(samples) or not is_possible(measured):
         return data
     measured = round(round(measured / STEP) * STEP, 2)
+    if measured <= data.supply.droop_bar:
+        return data
     told = data.supply.model_dump(exclude_unset=True) | {"pressure_bar": measured}
     return data.model_copy(update={"supply": Supply.model_validate(told)})

@@ -18,7 +18,7 @@ from twin.model import theta as c
 from twin.model.gas import R
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
-from twin.monitor.measured_supply import LEAST, MOST, is_possible
+from twin.monitor.measured_supply import LEAST, MOST, is_gauge, is_possible, with_nozzle_on
 from twin.monitor.rows import time_steps
 from twin.monitor.switching_detector import DetectorSettings, PhaseFinder
 from twin.quality import BREAK, UNUSABLE
@@ -69,6 +69,7 @@ class _View:
     idle: Rows
     theta: Theta
     detector: DetectorSettings
+    gauged: bool  # the data set's supply is one that was measured
 
     @cached_property
     def ambient(self) -> tuple[float, float]:
@@ -98,9 +99,12 @@ class _View:
 
 
 def check(
-    cycle: Cycle, theta: Theta, detector: DetectorSettings
+    cycle: Cycle, theta: Theta, detector: DetectorSettings, *, gauged: bool = False
 ) -> dict[str, Contradiction | None]:
-    """Outcome of a whole cycle for each present signal, by its tag; None if it agrees."""
+    """Outcome of a whole cycle for each present signal, by its tag; None if it agrees.
+
+    With ``gauged`` the supply of ``theta`` was measured, so a gauge is compared with it.
+    """
     samples = cycle.samples
     if not _has_reports(samples):
         return {}
@@ -108,7 +112,7 @@ def check(
     pressure = np.where(usable, samples["pressure"], np.nan).astype(np.float64)
     commands = samples["commands"] & (Command.SUCTION | Command.BLOW_OFF)
     suction, idle = commands == Command.SUCTION, commands == 0
-    view = _View(samples, cycle.ticks, pressure, suction, idle, theta, detector)
+    view = _View(samples, cycle.ticks, pressure, suction, idle, theta, detector, gauged)
     outcomes: dict[str, Contradiction | None] = {}
     for check_signal in (_nozzle, _part, _barometer, _second_pressure, _flow, _supply):
         outcomes |= check_signal(view)
@@ -116,12 +120,15 @@ def check(
 
 
 def standing(
-    cycles: Iterable[Cycle], theta: Theta, detector: DetectorSettings
+    cycles: Iterable[Cycle], theta: Theta, detector: DetectorSettings, *, gauged: bool = False
 ) -> list[Contradiction]:
-    """Contradictions of a record that occur in more than half of the cycles with an outcome."""
+    """Contradictions of a record that occur in more than half of the cycles with an outcome.
+
+    ``gauged`` as in ``check``.
+    """
     outcomes_by_signal: dict[str, list[Contradiction | None]] = {}
     for cycle in cycles:
-        for signal, contradiction in check(cycle, theta, detector).items():
+        for signal, contradiction in check(cycle, theta, detector, gauged=gauged).items():
             outcomes_by_signal.setdefault(signal, []).append(contradiction)
     grouped = (
         (outcomes, [contradiction for contradiction in outcomes if contradiction is not None])
@@ -299,13 +306,11 @@ def _flow(view: _View) -> dict[str, Contradiction | None]:
 def _supply(view: _View) -> dict[str, Contradiction | None]:
     measured = view.at_rest(view.samples["supply"].astype(np.float64) / BAR)
     usual = float(view.theta[c.SUPPLY]) / BAR
-    if not np.isfinite(measured):
+    if not is_gauge(view.samples) or not np.isfinite(measured):
         return {}
     if not is_possible(measured):
-        finding = f"the supply reads {measured:.1f} bar, and the ejector evacuates"
-        action = f"check unit and scale of the tag supply: ejectors need {LEAST:g} to {MOST:g} bar"
-        return _contradicts("supply", finding, action) if _evacuates(view) else {}
-    if abs(measured - usual) <= SUPPLY_APART:
+        return _impossible_at_rest(view, measured)
+    if not view.gauged or abs(measured - usual) <= SUPPLY_APART:
         return {"supply": None}
     moved, share = _moved_by_supply(view, measured)
     if not moved >= SHOWS:
@@ -320,8 +325,21 @@ def _supply(view: _View) -> dict[str, Contradiction | None]:
     return _contradicts("supply", finding, action)
 
 
+def _impossible_at_rest(view: _View, measured: float) -> dict[str, Contradiction | None]:
+    """Check a gauge that reads no possible supply at rest: behind the valve it does so rightly."""
+    readings = with_nozzle_on(view.samples, view.ticks)
+    if not len(readings) or not _evacuates(view):
+        return {}
+    if is_possible(float(np.median(readings))):
+        return {"supply": None}
+    finding = f"the supply reads {measured:.1f} bar, and the ejector evacuates"
+    action = f"check unit and scale of the tag supply: ejectors need {LEAST:g} to {MOST:g} bar"
+    return _contradicts("supply", finding, action)
+
+
 def _evacuates(view: _View) -> bool:
-    return bool(np.nanmax(view.pressure) - np.nanmin(view.pressure) > DEEP)
+    pressure = view.pressure[np.isfinite(view.pressure)]
+    return bool(len(pressure) and np.ptp(pressure) > DEEP)
 
 
 def _moved_by_supply(view: _View, supply: float) -> tuple[float, float]:
@@ -367,6 +385,7 @@ class ReportWatch:
 
     theta: Theta
     detector: DetectorSettings
+    gauged: bool = False  # as in ``check``
     _standing: dict[str, Contradiction] = field(default_factory=dict)  # reported contradictions
     _opposing: dict[str, int] = field(default_factory=dict)  # successive cycles against the report
 
@@ -374,7 +393,8 @@ class ReportWatch:
         """Check a cycle; an incomplete one is ignored."""
         if not cycle.complete:
             return
-        for signal, contradiction in check(cycle, self.theta, self.detector).items():
+        outcomes = check(cycle, self.theta, self.detector, gauged=self.gauged)
+        for signal, contradiction in outcomes.items():
             if (contradiction is None) == (signal not in self._standing):
                 self._opposing[signal] = 0
                 continue
