@@ -144,11 +144,11 @@ def test_kinds_of_tables_are_found_at_their_places() -> None:
 def test_comments_beside_and_above_a_key_are_read() -> None:
     supply = {one.__name__: one for _, one in tables_below(sections()["data"][""])}["Supply"]
     comments = comments_of(supply)
-    assert comments["pressure_bar"] == "gauge, at the regulator"
-    assert comments["optimum_bar"].startswith("At which suction is greatest")
+    assert comments["pressure_bar"] == "gauge pressure at the regulator"
+    assert comments["optimum_bar"].startswith("Gauge pressure of the greatest suction")
     tag = sections()["driver"]["modbus"].model_fields["tags"].annotation
     pressure = next(models_at(tag, ("pressure",)))
-    assert comments_of(pressure)["scale"] == "of the raw number"  # of a class above its own
+    assert comments_of(pressure)["scale"] == "factor on the raw number"  # of a class above its own
     assert defaults_of(pressure)["scale"] == 1.0
 
 
@@ -207,7 +207,7 @@ def test_the_schema_says_what_a_key_is_and_its_default() -> None:
     ring: dict[str, Any] = definitions["Ring"]["properties"]
     assert ring["records"] == {
         "type": "string",
-        "description": "the first register of the ring",
+        "description": "first register of the ring",
         "default": "holding:1000",
     }
     assert definitions["ImportSettings"]["properties"]["period_ms"]["description"]

@@ -389,6 +389,7 @@ def test_weather_and_set_up_alone_cannot_be_mended() -> None:
 OTHER_MEANINGS = {
     # "leakage" is the key figure (mbar/s) of a cycle, with limits and warnings of its own.
     "alarms/limits.py": {"leakage"},
+    "calibration/doubts.py": {"leakage"},
     "figures/cycle.py": {"leakage"},
     "figures/settings.py": {"leakage"},
     "figures/key_figures.py": {"leakage"},
