@@ -19,8 +19,8 @@ from twin.figures.cycle_view import (
     LONGEST_HOLE,
     Floats,
     Rows,
+    find_in_cycle,
 )
-from twin.figures.cycle_view import course as found_in
 from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.figures.key_figures import FIGURES, Unit, figures, table
 from twin.figures.settings import FigureSettings, Limits, limits
@@ -375,7 +375,7 @@ def line_through(time: Floats, values: Floats) -> tuple[float, float]:
 
 @given(any_rows())
 def test_how_the_nozzle_was_switched_is_as_numpy_has_it(rows: Rows) -> None:
-    found = found_in(rows, 550.0, 750.0)
+    found = find_in_cycle(rows, 550.0, 750.0)
     over = np.flatnonzero(~np.isin(rows.phase, (SUCTION, HOLD)))
     suction = rows.phase[: over[0]] if len(over) else rows.phase
     on = suction == SUCTION
@@ -394,7 +394,7 @@ def test_how_the_nozzle_was_switched_is_as_numpy_has_it(rows: Rows) -> None:
 
 @given(any_rows())
 def test_what_the_vacuum_did_is_as_numpy_has_it(rows: Rows) -> None:
-    course = found_in(rows, 550.0, 750.0)
+    course = find_in_cycle(rows, 550.0, 750.0)
     found = course.vacuum
     over = np.flatnonzero(~np.isin(rows.phase, (SUCTION, HOLD)))
     suction = slice(over[0] if len(over) else None)
@@ -436,7 +436,7 @@ def test_what_the_vacuum_did_is_as_numpy_has_it(rows: Rows) -> None:
 
 @given(any_rows())
 def test_the_supply_is_as_numpy_has_it(rows: Rows) -> None:
-    found = found_in(rows, 550.0, 750.0).supply
+    found = find_in_cycle(rows, 550.0, 750.0).supply
     read = rows.supply[(rows.phase == SUCTION) & np.isfinite(rows.supply)]
     if not len(read):
         assert unknown(found._asdict(), *found._fields)

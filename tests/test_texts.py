@@ -173,3 +173,13 @@ def test_a_text_without_translation_stays_english() -> None:
         assert age(0, 5 * SECOND_NS) == "vor 5 s"
         assert tr("nobody has translated this") == "nobody has translated this"
     assert age(0, 5 * SECOND_NS) == "5 s ago"
+
+
+def test_scripts_have_their_own_texts_in_german_and_no_others() -> None:
+    scripts = (path.read_text(encoding="utf-8") for path in STATIC.glob("*.js"))
+    literal = {text for script in scripts for text in re.findall(r'\bt\("([^"\\]+)"', script)}
+    texts = Catalogues().of_scripts("de")
+    assert len(literal) > 50
+    assert literal <= texts.keys()
+    assert len(texts) < len(Catalogues().languages["de"].texts) / 3
+    assert Catalogues().of_scripts("en") == {}

@@ -9,7 +9,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.pofile import read_po
 from babel.numbers import get_decimal_symbol
 
-from twin.languages.texts import ENGLISH, Language
+from twin.languages.texts import ENGLISH, Language, Texts
 
 MOST_ASKED = 20  # languages of a browser that are considered
 THIN_SPACE = "\u202f"  # between thousands after ISO 80000-1; a line does not break there
@@ -38,6 +38,16 @@ class Catalogues:
     def plural_expression(self, code: str) -> str:
         """The index of the plural form of ``n`` as an expression of C, as gettext has it."""
         return str(self._catalogs[code].plural_expr) if code in self._catalogs else "(n != 1)"
+
+    def of_scripts(self, code: str) -> Texts:
+        """The texts of a language that scripts in a browser have, by the files they are from."""
+        texts = self.languages[code].texts
+        ids = (
+            message.id[0] if isinstance(message.id, tuple | list) else message.id
+            for message in self._catalogs.get(code, ())
+            if any(path.endswith(".js") for path, _ in message.locations)
+        )
+        return {text: texts[text] for text in ids if text in texts}
 
     def choose(self, chosen: str, accepted: str) -> str:
         """The code of a language: the ``chosen`` one, else the best that a browser accepts."""

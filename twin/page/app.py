@@ -204,7 +204,7 @@ class Page:
         language = self._catalogues.languages[code]
         constants = {
             "LANGUAGE": code,
-            "TEXTS": dict(language.texts),
+            "TEXTS": self._catalogues.of_scripts(code),
             "DECIMAL": language.decimal,
             "GROUP": language.group,
         }
