@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from drivers.plc.simulate import with_truth
 from twin.config import Config
 from twin.diagnosis import another_log
 from twin.diagnosis import answer as answer_module
-from twin.diagnosis.another_log import conditions, judged_on, program
+from twin.diagnosis.another_log import _other_program, conditions, judged_on, program
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import Evidence, collect
 from twin.diagnosis.text import on_another_log
@@ -30,8 +31,9 @@ from twin.log.recorder import Recorder
 from twin.model.courses import Cause
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import apply
+from twin.model.plant import suction_at
 from twin.model.term import Term
-from twin.signals import Samples
+from twin.signals import MBAR, SAMPLE, Command, Samples
 
 
 def recorded(longer: float, seed: int, *faults: str, supply_bar: float = 5.0) -> Samples:
@@ -126,6 +128,19 @@ def test_a_data_set_at_another_supply_is_as_after_a_drop_of_it() -> None:
     assert own.at_supply(5.0) == own
 
 
+def test_a_higher_supply_lowers_the_end_pressure_by_the_law_of_the_type() -> None:
+    """The law that a diagnosis tries is that of a supply below nominal."""
+    own = rigs.config("gripper").data
+    steep = own.ejector.model_copy(update={"end_follows_supply": 6.0})
+    tried = own.model_copy(update={"ejector": steep})
+
+    def end(data: DataSet, supply: float) -> float:
+        return data.at_supply(supply).ejector.end_pressure_mbar
+
+    assert end(tried, 5.9) == end(own, 5.9) < own.ejector.end_pressure_mbar
+    assert end(tried, 4.5) > end(own, 4.5) > own.ejector.end_pressure_mbar
+
+
 def changed(**tables: Mapping[str, Any]) -> Config:
     """The gripper's configuration with other values in its data set."""
     config = rigs.config("gripper")
@@ -155,7 +170,16 @@ def test_the_other_logs_supply_parts_and_sensor_hold_for_it() -> None:
     assert under(smaller_cup()).data.system.parts == smaller_cup().data.system.parts
     gauge = {"sensor": {"reference": "gauge"}, "ambient": {"pressure_mbar": 963.0}}
     assert under(changed(**gauge)).is_gauge
-    assert under(changed(**gauge)).data.ambient.pressure_mbar == 963.0
+    there = under(changed(**gauge)).data
+    assert there.ambient.pressure_mbar == 963.0
+    ratio = 963.0 / own.ambient.pressure_mbar  # the jet of that day, as in the model
+    shifted = apply(
+        coefficients(own), "ambient_pressure", {"shift": 963.0 - own.ambient.pressure_mbar}
+    )
+    assert suction_at(coefficients(there), 500.0 * MBAR) == pytest.approx(
+        suction_at(shifted, 500.0 * MBAR), rel=0.02
+    )
+    assert there.ejector.end_pressure_mbar == pytest.approx(own.ejector.end_pressure_mbar * ratio)
     absolute = under(changed(ambient={"pressure_mbar": 963.0}))
     assert absolute.data.ambient == own.ambient  # it would only say that the weather differs
 
@@ -227,6 +251,24 @@ def test_a_curve_is_not_carried_to_another_program() -> None:
     text = on_another_log({"judged_on": longer}, "")
     assert f"left out       {longer['left_out']}" in text
     assert "left out" not in on_another_log({"judged_on": plain}, "")
+
+
+@pytest.mark.parametrize(("later_ms", "left_out"), [(10, False), (30, True)])
+def test_a_command_that_is_seen_a_row_later_is_no_other_program(
+    later_ms: int, left_out: bool
+) -> None:
+    """Rows come 10 ms apart."""
+    rows = np.arange(0, 1000, 10)
+
+    def of(end_ms: int) -> Any:
+        samples = np.zeros(len(rows), SAMPLE)
+        samples["time_ns"] = rows * 1_000_000
+        samples["commands"][(rows >= 100) & (rows < end_ms)] = Command.SUCTION
+        samples["commands"][(rows >= end_ms) & (rows < 700)] = Command.BLOW_OFF
+        return SimpleNamespace(samples=samples, starts=np.array([0, len(rows)]), judged=[0])
+
+    here = SimpleNamespace(evidence=of(400))
+    assert bool(_other_program(here, of(400 + later_ms))) is left_out  # type: ignore[arg-type]
 
 
 def test_a_curve_alone_gains_nothing_on_another_program() -> None:

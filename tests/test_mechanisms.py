@@ -29,7 +29,7 @@ from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
 from twin.diagnosis.extend import extended, nothing, remarks
-from twin.diagnosis.mechanism_picture import _elapsed, inferred
+from twin.diagnosis.mechanism_picture import _elapsed, _least_squares, inferred
 from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
 from twin.diagnosis.pictures import Found
 from twin.diagnosis.propose import Proposal, _range, proposed
@@ -485,3 +485,13 @@ def test_time_is_counted_anew_where_a_jet_or_a_cycle_begins() -> None:
         assert in_cycle[0] < 0.0015
         assert in_cycle[-1] == pytest.approx((len(in_cycle) - 1) * 0.001, abs=0.002)
     assert np.nanmax(off) < 2.0
+
+
+def test_a_size_that_the_pressure_does_not_show_has_no_dot() -> None:
+    rng = np.random.default_rng(3)
+    response = np.column_stack([rng.normal(size=50), np.zeros(50), rng.normal(size=50)])
+    residual = rng.normal(size=50) - response @ np.array([2.0, 7.0, -1.0])
+    more, sigma = _least_squares(residual, response)
+    assert more == pytest.approx([2.0, 0.0, -1.0], abs=4.0 * sigma[0])
+    assert np.isinf(sigma[1])
+    assert sigma[[0, 2]] == pytest.approx(1.0 / np.sqrt(50.0), rel=0.3)

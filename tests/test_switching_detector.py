@@ -15,6 +15,7 @@ from drivers.plc.simulate import blocks, with_truth
 from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
+from twin.model.effects import apply
 from twin.monitor.detector_window import (
     LONGEST_WINDOW,
     detector_of,
@@ -530,3 +531,12 @@ def test_where_a_sensor_is_too_slow_for_its_window_a_wider_one_sees_more(
         for _, phase, _ in (find(samples, detector) for detector in (rigs.detector(name), wider))
     )
     assert few < most >= SECONDS // 3.2 - 1  # cycles are 3.2 s long
+
+
+def test_by_each_law_the_detector_knows_how_far_the_end_pressure_is_away() -> None:
+    theta = rigs.theta("gripper")
+    left = float(theta[c.AMBIENT] * (1.0 - theta[c.END_RATIO]) - theta[c.H1]) / MBAR
+    laws = [{"end_pressure_rise": 0.9 * left, "end_loss_moves": share} for share in (0.0, 1.0)]
+    pivots, moves = (apply(theta, "end_vacuum_loss", law) for law in laws)
+    longest = expected_detector(pivots, 30.0).longest
+    assert expected_detector(moves, 30.0).longest == pytest.approx(longest, rel=0.3)

@@ -56,8 +56,6 @@ def write_page(
 
 
 def _page(commissioned: Commissioned, asset: Asset) -> str:
-    mark, colour = MARKS[commissioned.verdict.word]
-    cycles = commissioned.calibration.cycles
     why = [page.paragraph(f"{capital(text)}.") for text in sentences(commissioned.verdict)]
     parts = [
         page.section(tr("Why"), "\n".join(why)),
@@ -70,19 +68,27 @@ def _page(commissioned: Commissioned, asset: Asset) -> str:
             page.details(tr("All values of the data set"), _parameters(commissioned.calibration)),
         ),
     ]
+    footer = ntr(
+        "{count} cycle; pressures in mbar, intervals of 95 %",
+        "{count} cycles; pressures in mbar, intervals of 95 %",
+        commissioned.calibration.cycles,
+    )
+    verdict = commissioned.verdict
+    return framed(asset, verdict.word, f"{_result(verdict)}.", "\n".join(parts), footer)
+
+
+def framed(asset: Asset, word: str, headline: str, body: str, footer: str) -> str:
+    """The page of a commissioning: the ``word`` of its verdict, and the sections in ``body``."""
+    mark, colour = MARKS[word]
     return page.PAGE.substitute(
         language=language_code(),
         title=html.escape(tr("Commissioning of {unit}", unit=asset.id)),
         colour=colour,
         mark=mark,
-        verdict=html.escape(f"{capital(tr(commissioned.verdict.word))} – {asset.type} {asset.id}"),
-        headline=html.escape(f"{_result(commissioned.verdict)}."),
-        body="\n".join(parts),
-        footer=ntr(
-            "{count} cycle; pressures in mbar, intervals of 95 %",
-            "{count} cycles; pressures in mbar, intervals of 95 %",
-            cycles,
-        ),
+        verdict=html.escape(f"{capital(tr(word))} – {asset.type} {asset.id}"),
+        headline=html.escape(headline),
+        body=body,
+        footer=footer,
     )
 
 

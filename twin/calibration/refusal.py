@@ -1,16 +1,15 @@
 """The page of a record that cannot be commissioned: the reason, and what to do."""
 
-import html
 from pathlib import Path
 
-from twin.calibration.page import MARKS
+from twin.calibration.page import framed
 from twin.config import Asset
 from twin.diagnosis import page
 from twin.diagnosis.retelling import retold
 from twin.diagnosis.text import capital
 from twin.errors import TwinError
 from twin.files import write_text
-from twin.languages.texts import ENGLISH, Language, language_code, speaking, tr
+from twin.languages.texts import ENGLISH, Language, speaking, tr
 
 
 def write_refusal(error: TwinError, asset: Asset, path: Path, language: Language = ENGLISH) -> None:
@@ -20,16 +19,11 @@ def write_refusal(error: TwinError, asset: Asset, path: Path, language: Language
 
 
 def _page(error: TwinError, asset: Asset) -> str:
-    mark, colour = MARKS["refused"]
-    word = capital(tr("refused"))
     sentences = [capital(retold(text)) for text in (str(error), error.hint) if text]
-    return page.PAGE.substitute(
-        language=language_code(),
-        title=html.escape(tr("Commissioning of {unit}", unit=asset.id)),
-        colour=colour,
-        mark=mark,
-        verdict=html.escape(f"{word} – {asset.type} {asset.id}"),
-        headline=html.escape(tr("No twin was fitted to this record.")),
-        body=page.section(tr("Why"), page.paragraph(f"{'. '.join(sentences)}.")),
-        footer=tr("Nothing is stored."),
+    return framed(
+        asset,
+        "refused",
+        tr("No twin was fitted to this record."),
+        page.section(tr("Why"), page.paragraph(f"{'. '.join(sentences)}.")),
+        tr("Nothing is stored."),
     )

@@ -135,15 +135,23 @@ def _refitted(
     off = evidence.off_where(hypothesis, masks, change)
     level = levels(evidence, weights.cycles, [hypothesis])
     white = weights.white(off, np.repeat(level, len(masks), axis=1))
-    residual, response = white[:, 0], white[:, 1:] - white[:, :1]
-    normal = response.T @ response
-    unseen = np.diag(normal) <= UNSEEN * np.diag(normal).max(initial=0.0)
-    inverse = np.linalg.pinv(normal)
-    inverse[unseen, unseen] = np.inf
-    more = np.where(unseen, 0.0, -np.linalg.pinv(normal) @ response.T @ residual)
+    return _least_squares(white[:, 0], white[:, 1:] - white[:, :1])
+
+
+def _least_squares(residual: Floats, response: Floats) -> tuple[Floats, Floats]:
+    """Changes that remove a whitened ``residual`` best, and their sigmas.
+
+    ``response`` is (residuals, changes). The sigma of a change that moves nothing is infinite.
+    """
+    information = np.sum(response**2, axis=0)
+    seen = information > UNSEEN * information.max(initial=0.0)
+    more, sigma = np.zeros(len(seen)), np.full(len(seen), np.inf)
+    inverse = np.linalg.pinv(response[:, seen].T @ response[:, seen])
+    more[seen] = -inverse @ response[:, seen].T @ residual
     left = residual + response @ more
     scale = max(float(left @ left) / max(len(left) - len(more), 1), 1.0)
-    return more, np.sqrt(np.diag(inverse) * scale)
+    sigma[seen] = np.sqrt(np.diag(inverse) * scale)
+    return more, sigma
 
 
 def _grouped(evidence: Evidence, x: Floats, cycles: Sequence[int]) -> Ints:
