@@ -1,48 +1,50 @@
 """The table of drivers: which kinds of source a configuration can name."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from drivers.modbus import source as modbus
-from drivers.modbus.connection_pool import ConnectionPool
-from drivers.modbus.probe import probe
-from drivers.modbus.settings import ModbusSettings
-from drivers.probe import Line
+from drivers import installed
+from drivers.connection_pool import ConnectionPool
+from drivers.driver import AnyDriver, cannot_write
 from drivers.reconnect import Away
-from twin.errors import ConfigError, SourceError
-from twin.extras import require
-from twin.settings import Document
+from drivers.settings import DriverSettings
+from twin.errors import ConfigError, SourceError, known_names
+from twin.settings import Document, Settings
 from twin.signals import Samples
 
-if TYPE_CHECKING:
-    from drivers.opcua.source import OpcuaSettings
 
-KINDS = ("modbus", "opcua")
+def _modbus() -> type[AnyDriver]:
+    from drivers.modbus.driver import ModbusDriver  # noqa: PLC0415 - of a protocol in use
+
+    return ModbusDriver
+
+
+def _opcua() -> type[AnyDriver]:
+    from drivers.opcua.driver import OpcuaDriver  # noqa: PLC0415 - of a protocol in use
+
+    return OpcuaDriver
+
+
+DEFAULT = "modbus"  # without a kind
+BUILT_IN: dict[str, Callable[[], type[AnyDriver]]] = {DEFAULT: _modbus, "opcua": _opcua}
 
 
 def open_source(
     document: Document,
     address: str = "",
-    lines: ConnectionPool | None = None,
+    pool: ConnectionPool | None = None,
     away: Away | None = None,
     *,
     known: bool = False,
 ) -> Iterator[Samples]:
     """The blocks of the source that ``[driver]`` names; ``address`` (host:port) overrides its own.
 
-    Sources opened with the same ``lines`` share a connection where the protocol allows it.
+    Sources opened with the same ``pool`` share a connection where the protocol allows it.
     Raises ConfigError for an unknown kind or bad settings, SourceError if the PLC does not answer.
     With ``away``, which receives the reason, it is retried until it answers. A ``known`` source has
     given rows before: it is retried whatever it sends.
     """
-    settings = settings_of(document, address)
-    if isinstance(settings, ModbusSettings):
-        return modbus.blocks(settings, lines=lines, away=away, known=known)
-    require("opcua", "a PLC over OPC UA")
-    from drivers.opcua import source as opcua  # noqa: PLC0415 - the library takes its time
-
-    return opcua.blocks(settings, away=away, known=known)
+    return driver_of(document, address, pool).blocks(away, known=known)
 
 
 def probe_source(document: Document, address: str = "") -> Iterator[str]:
@@ -51,7 +53,7 @@ def probe_source(document: Document, address: str = "") -> Iterator[str]:
     SourceError after the last line if any inspection failed.
     """
     shown_hints: set[str] = set()
-    lines = _probed(settings_of(document, address))
+    lines = driver_of(document, address).probe()
     for line in lines:
         yield f"{'ok ' if line.good else '!! '} {line.what:<14} {line.text}"
         if line.hint and line.hint not in shown_hints:
@@ -61,36 +63,75 @@ def probe_source(document: Document, address: str = "") -> Iterator[str]:
         raise SourceError(f"{document.name}: not as configured: {', '.join(failed)}")
 
 
-def _probed(settings: "ModbusSettings | OpcuaSettings") -> list[Line]:
-    if isinstance(settings, ModbusSettings):
-        return probe(settings)
-    require("opcua", "a PLC over OPC UA")
-    from drivers.opcua import probe as opcua_probe  # noqa: PLC0415 - the library takes its time
+def driver_of(
+    document: Document, address: str = "", pool: ConnectionPool | None = None
+) -> AnyDriver:
+    """The driver that ``[driver]`` names, with its settings; errors as from ``settings_of``."""
+    kind, origin = _find(document)
+    settings = _settings(document, kind, address)
+    if origin:
+        return installed.GuardedDriver(lambda: kind(settings, pool), origin)
+    return kind(settings, pool)
 
-    return opcua_probe.probe(settings)
+
+def settings_of(document: Document, address: str = "") -> DriverSettings:
+    """Where the source is and what it holds.
+
+    ConfigError for an unknown kind, a driver that cannot be used, bad settings or a bad address.
+    """
+    return _settings(document, driver_class(document), address)
 
 
-def settings_of(document: Document, address: str = "") -> "ModbusSettings | OpcuaSettings":
-    """Where the source is and what it holds; raises as ``open_source``."""
-    settings = _configured(document)
+def hil_settings_of(document: Document) -> Settings:
+    """What ``[hil]`` lists; ConfigError as from ``driver_class``, or if the driver only reads."""
+    kind = driver_class(document)
+    if kind.hil_settings_class is None:
+        raise cannot_write(document, document.tables["driver"]["kind"])
+    return document.section(kind.hil_settings_class, "hil")
+
+
+def driver_class(document: Document) -> type[AnyDriver]:
+    """The class of the driver that ``[driver]`` names; without such a table the default one.
+
+    ConfigError for an unknown kind, or if it cannot be used.
+    """
+    return _find(document)[0]
+
+
+def _find(document: Document) -> tuple[type[AnyDriver], str]:
+    """The class of the driver, and where it is from; "" if it is built in."""
+    table = document.tables.get("driver")
+    kind = str(table.get("kind", DEFAULT)) if isinstance(table, dict) else DEFAULT
+    if kind in BUILT_IN:
+        return BUILT_IN[kind](), ""
+    try:
+        found = installed.load(kind)
+    except ConfigError as error:
+        raise ConfigError(f"{document.name}: {error}", error.hint) from error
+    if found is None:
+        raise _unknown(document, kind)
+    return found
+
+
+def _unknown(document: Document, kind: str) -> ConfigError:
+    """The error for a kind that is neither built in nor installed."""
+    others = installed.installed()
+    brought = "".join(f"; {name!r} comes with {package}" for name, package in others.items())
+    return ConfigError(
+        f"{document.name}: unknown driver {kind!r}",
+        f"{known_names(kind, [*BUILT_IN, *others])}{brought}; a driver for another PLC is a package"
+        " of its own, docs/write-a-driver.md",
+    )
+
+
+def _settings(document: Document, kind: type[AnyDriver], address: str) -> DriverSettings:
+    if "driver" not in document.tables:
+        raise ConfigError(f"{document.name}: there is no [driver] table", "say where the PLC is")
+    folder = Path(document.name).parent  # files lie there, wherever the program was started
+    settings = document.section(kind.settings_class, "driver").below(folder)
     if not address:
         return settings
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= 0xFFFF:
         raise ConfigError(f"{address!r} is no address", "write it as HOST:PORT, e.g. 10.0.0.5:502")
     return settings.at(host, int(port))
-
-
-def _configured(document: Document) -> "ModbusSettings | OpcuaSettings":
-    table = document.tables.get("driver")
-    if table is None:
-        raise ConfigError(f"{document.name}: there is no [driver] table", "say where the PLC is")
-    kind = table.get("kind", "modbus")
-    if kind not in KINDS:
-        raise ConfigError(f"{document.name}: unknown driver {kind!r}", f"known: {', '.join(KINDS)}")
-    folder = Path(document.name).parent  # files lie there, wherever the program was started
-    if kind == "modbus":
-        return document.section(ModbusSettings, "driver").below(folder)
-    from drivers.opcua.settings import OpcuaSettings  # noqa: PLC0415 - of a protocol in use
-
-    return document.section(OpcuaSettings, "driver").below(folder)

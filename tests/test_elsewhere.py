@@ -15,7 +15,7 @@ del signal.SIGUSR1, signal.SIGUSR2, os.getuid, os.getpriority, os.setpriority
 MODULES = ["twin.cli", "twin.page.ring", "twin.model.compiled", "drivers.plc.live"]
 MODULES += [
     "drivers.outputs.results",
-    "drivers.modbus.client",
+    "drivers.modbus.driver",
     "drivers.sources",
     "twin.diagnosis.process",
 ]

@@ -22,8 +22,9 @@ from command_line import twin
 from modbus_server import CUT, SILENT, ModbusServer
 from plc_process import PlcProcess, start_plc
 
+from drivers.connection_pool import ConnectionPool
 from drivers.modbus.client import ModbusClient
-from drivers.modbus.connection_pool import ConnectionPool, Line
+from drivers.modbus.line import Line, line_to
 from drivers.modbus.settings import ModbusSettings
 from drivers.opcua.settings import TraceNodes
 from drivers.reconnect import LostError
@@ -77,7 +78,7 @@ def settings_for(server: ModbusServer, **changes: Any) -> ModbusSettings:
 @contextmanager
 def sharing(server: ModbusServer, count: int = 2) -> Iterator[list[ModbusClient]]:
     lines, settings = ConnectionPool(), settings_for(server)
-    links = [ModbusClient(settings, lines.to(settings)) for _ in range(count)]
+    links = [ModbusClient(settings, line_to(settings, lines)) for _ in range(count)]
     try:
         for link in links:
             link.open()
@@ -96,10 +97,10 @@ def server() -> Iterator[ModbusServer]:
 
 def test_who_asks_the_same_plc_has_the_same_line(server: ModbusServer) -> None:
     lines = ConnectionPool()
-    line = lines.to(settings_for(server))
-    assert lines.to(settings_for(server, unit=7)) is line
-    assert lines.to(settings_for(server, port=server.port % 60_000 + 1)) is not line
-    assert lines.to(settings_for(server, host="localhost")) is not line
+    line = line_to(settings_for(server), lines)
+    assert line_to(settings_for(server, unit=7), lines) is line
+    assert line_to(settings_for(server, port=server.port % 60_000 + 1), lines) is not line
+    assert line_to(settings_for(server, host="localhost"), lines) is not line
 
 
 def test_all_come_over_one_connection_and_each_gets_its_own_answer(server: ModbusServer) -> None:

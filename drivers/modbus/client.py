@@ -10,8 +10,8 @@ from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu import bit_message as bits
 from pymodbus.pdu import register_message as registers
 
-from drivers.modbus.connection_pool import Line
 from drivers.modbus.errors import lost, refused
+from drivers.modbus.line import Line
 from drivers.modbus.plan import Request
 from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.tls import rejection, secured

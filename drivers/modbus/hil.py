@@ -4,8 +4,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from drivers.connection_pool import ConnectionPool
 from drivers.modbus.client import ModbusClient
-from drivers.modbus.connection_pool import ConnectionPool
+from drivers.modbus.line import line_to
 from drivers.modbus.settings import ModbusSettings
 from drivers.outputs.writer import Outputs, Ranged, Writer, counted, refuse_empty, refuse_no_range
 from drivers.tags import CODE, Address, Pressure, Tag, words_of
@@ -109,10 +110,10 @@ class RegisterOutlet:
 
 
 def writer(
-    driver: ModbusSettings, document: Document, lines: ConnectionPool | None = None
+    driver: ModbusSettings, document: Document, pool: ConnectionPool | None = None
 ) -> Writer:
-    """The writer to this PLC, over a shared connection where there are ``lines``."""
+    """The writer to this PLC, over a shared connection of a ``pool``."""
     settings = document.section(HilSettings, "hil")
-    link = ModbusClient(driver, None if lines is None else lines.to(driver))
+    link = ModbusClient(driver, line_to(driver, pool))
     outlet = RegisterOutlet(link, driver, settings.tags)
     return Writer(outlet, driver.where, settings.min_interval_ms)

@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from drivers.modbus.tls import PlcTls
 from drivers.optional_signals import BITS, refuse_unclear
+from drivers.settings import DriverSettings
 from drivers.tags import Address, Flow, Place, Pressure, Tag, Temperature, WordOrder
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.settings import KeyedError, Settings
@@ -57,7 +58,7 @@ class Ring(Settings):
         return self
 
 
-class ModbusSettings(Settings):
+class ModbusSettings(DriverSettings):
     """The ``[driver]`` table for a Modbus PLC."""
 
     kind: Literal["modbus"] = "modbus"  # kind of driver

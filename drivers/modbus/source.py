@@ -2,8 +2,9 @@
 
 from collections.abc import Generator
 
+from drivers.connection_pool import ConnectionPool
 from drivers.modbus.client import ModbusClient
-from drivers.modbus.connection_pool import ConnectionPool
+from drivers.modbus.line import line_to
 from drivers.modbus.poll import Poller
 from drivers.modbus.poll_socket import PollSocket
 from drivers.modbus.ring import Trace
@@ -15,7 +16,7 @@ from twin.signals import Samples
 def blocks(
     settings: ModbusSettings,
     clock: Clock = REAL,
-    lines: ConnectionPool | None = None,
+    pool: ConnectionPool | None = None,
     away: Away | None = None,
     *,
     known: bool = False,
@@ -26,12 +27,12 @@ def blocks(
     lost connection, and shows as empty blocks and flags. Before that, a PLC that is absent or does
     not serve an address is retried only with ``away``; other SourceErrors are raised. ``away``
     receives why there are no rows. Closing releases all.
-    With ``lines``, block mode shares its connection with others; polling has no millisecond to wait
-    for them.
+    With a ``pool``, block mode shares its connection with others; polling has no millisecond to
+    wait for them.
     """
     if settings.mode == "poll":
         link = PollSocket(settings) if settings.tls is None else ModbusClient(settings)
         return in_thread(reconnecting(Poller(settings, clock), link, clock, away, known=known))
-    client = ModbusClient(settings, None if lines is None else lines.to(settings))
+    client = ModbusClient(settings, line_to(settings, pool))
     stream = reconnecting(Trace(settings, clock), client, clock, away, known=known)
     return stream if settings.tls is None else in_thread(stream)  # shaking hands takes time

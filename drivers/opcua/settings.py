@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from drivers.optional_signals import BITS, refuse_unclear
+from drivers.settings import DriverSettings
 from drivers.tags import Flowmeter, Quantity, Thermometer
 from drivers.trace import COMMAND_BITS, no_effect, refuse_unused
 from twin.secret import Secret
@@ -151,7 +152,7 @@ class User(Settings):
         return self
 
 
-class OpcuaSettings(Settings):
+class OpcuaSettings(DriverSettings):
     """The ``[driver]`` table for a PLC behind an OPC UA server."""
 
     kind: Literal["opcua"] = "opcua"  # kind of driver

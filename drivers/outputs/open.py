@@ -5,11 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.modbus.connection_pool import ConnectionPool
-from drivers.modbus.settings import ModbusSettings
+from drivers.connection_pool import ConnectionPool
 from drivers.outputs.settings import ResultsSettings
 from drivers.outputs.writer import Writer
-from drivers.sources import settings_of
+from drivers.sources import driver_of
 from twin.errors import ConfigError
 from twin.extras import require
 from twin.settings import Document
@@ -19,26 +18,19 @@ if TYPE_CHECKING:
 
 
 def open_writer(
-    document: Document, address: str = "", lines: ConnectionPool | None = None
+    document: Document, address: str = "", pool: ConnectionPool | None = None
 ) -> Writer:
     """The writer of what ``[hil]`` lists, to the PLC that ``[driver]`` names.
 
-    Raises ConfigError if nothing is listed, SourceError if the PLC does not answer.
+    Raises ConfigError if nothing is listed or the driver only reads, SourceError if the PLC does
+    not answer.
     """
     if not document.tables.get("hil", {}).get("tags"):
         raise ConfigError(
             f"{document.name}: nothing is listed under [hil.tags]",
             "list what may be written; docs/hil.md has an example",
         )
-    settings = settings_of(document, address)
-    if isinstance(settings, ModbusSettings):
-        from drivers.modbus import hil as hil_modbus  # noqa: PLC0415 - each protocol when it is needed
-
-        return hil_modbus.writer(settings, document, lines)
-    require("opcua", "a PLC over OPC UA")
-    from drivers.opcua import hil as hil_opcua  # noqa: PLC0415 - the library takes its time
-
-    return hil_opcua.writer(settings, document)
+    return driver_of(document, address, pool).writer(document)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -48,13 +48,13 @@ def schema() -> None:
 
 
 def sections() -> "dict[str, dict[str, type[Settings]]]":
-    """The tables of a configuration by name, each with its settings by kind of driver or ""."""
-    from drivers.modbus import hil as hil_modbus
-    from drivers.modbus.settings import ModbusSettings
-    from drivers.opcua.hil_settings import HilSettings as HilOverOpcua
-    from drivers.opcua.settings import OpcuaSettings
+    """The tables of a configuration by name, each with its settings by kind of driver or "".
+
+    Drivers of other packages are left out: what is made of the tables is the same everywhere.
+    """
     from drivers.outputs.settings import ResultsSettings
     from drivers.plc.settings import PlcSettings
+    from drivers.sources import BUILT_IN
     from twin.alarms.settings import AlarmSettings
     from twin.assets.database_url import AssetsSettings
     from twin.config import Asset, LogSettings
@@ -70,10 +70,11 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
     from twin.page.settings import PageSettings
     from twin.tables.settings import ImportSettings
 
+    drivers = {kind: load() for kind, load in BUILT_IN.items()}
     return {
         "asset": {"": Asset},
         "data": {"": DataSet},
-        "driver": {"modbus": ModbusSettings, "opcua": OpcuaSettings},
+        "driver": {kind: driver.settings_class for kind, driver in drivers.items()},
         "import": {"": ImportSettings},
         "monitor": {"": MonitorSettings},
         "log": {"": LogSettings},
@@ -86,7 +87,11 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
         "outlets": {"": OutletsSettings},
         "results": {"": ResultsSettings},
         "assets": {"": AssetsSettings},
-        "hil": {"modbus": hil_modbus.HilSettings, "opcua": HilOverOpcua},
+        "hil": {
+            kind: driver.hil_settings_class
+            for kind, driver in drivers.items()
+            if driver.hil_settings_class
+        },
         "plc": {"": PlcSettings},
     }
 
@@ -116,7 +121,7 @@ def _advice(error: ConfigError | SourceError) -> str:
 
 def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
     """Checks that may raise ConfigError: of each table, then of several tables together."""
-    from drivers.sources import settings_of
+    from drivers.sources import hil_settings_of, settings_of
     from twin.alarms.settings import chosen_rules
     from twin.config import TABLES, Config
     from twin.notifications.settings import chosen, chosen_upload
@@ -124,14 +129,13 @@ def _checks(document: "Document") -> Iterator[Callable[[], Any]]:
 
     for name in document.tables:
         yield partial(document.refuse_unknown_tables, TABLES | set(document.tables) - {name})
-    driver = document.tables.get("driver")
-    kind = driver.get("kind", "modbus") if isinstance(driver, dict) else "modbus"
     for name, kinds in sections().items():
-        settings = kinds.get("") or kinds.get(kind)
-        if name in document.tables and name != "data" and settings is not None:
-            yield partial(document.section, settings, name)
-    if driver is not None:
+        if name in document.tables and name != "data" and "" in kinds:
+            yield partial(document.section, kinds[""], name)
+    if "driver" in document.tables:
         yield partial(settings_of, document)
+    if "hil" in document.tables:
+        yield partial(hil_settings_of, document)
     yield partial(Config.of, document, to_store=True)
     if "data" in document.tables:  # a mistake in [asset] would hide those of [data]
         nobody = {name: document.tables[name] for name in TABLES & set(document.tables) - {"asset"}}
@@ -177,6 +181,7 @@ def json_schema() -> dict[str, Any]:
     for name, by_kind in kinds.items():
         refs = [names[(kind, "validation")] for kind in by_kind.values()]
         tables[name] = refs[0] if len(refs) == 1 else {"anyOf": refs}
+    tables["driver"]["anyOf"].append(_other_than(kinds["driver"]))
     reachable = _referenced(tables, definitions)
     return {
         "$schema": _SCHEMA,
@@ -186,6 +191,12 @@ def json_schema() -> dict[str, Any]:
         "additionalProperties": False,
         "$defs": {name: table for name, table in definitions.items() if name in reachable},
     }
+
+
+def _other_than(kinds: Iterable[str]) -> dict[str, Any]:
+    """The schema of a driver of another package: its keys are known to that package alone."""
+    kind = {"type": "string", "not": {"enum": list(kinds)}}
+    return {"type": "object", "properties": {"kind": kind}, "required": ["kind"]}
 
 
 def _referenced(schema: Any, definitions: dict[str, Any]) -> set[str]:

@@ -85,7 +85,7 @@ def run(
     answer yet is tried until it does. Where FILE is a folder, logs in it are named by asset and
     time. The oldest logs make room for new ones, as [log] says.
     """
-    from drivers.modbus.connection_pool import ConnectionPool
+    from drivers.connection_pool import ConnectionPool
     from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
     from twin.cli.compiling import Models
@@ -99,12 +99,12 @@ def run(
     _require_writable_targets(log, rrd)  # the PLC may answer much later
     ejectors = _by_asset([configured(Document.read(path), assets, unit) for path in configs])
     width = 0 if alone else max(map(len, ejectors))
-    lines = ConnectionPool()
+    pool = ConnectionPool()
 
     def run_one(name: str, settings: "Config") -> None:
         label = "" if alone else name
         alarms, outlets = alarms_of(settings, complain), outlets_of(settings, complain)
-        source_arguments = settings.document, address, lines if hil or not alone else None
+        source_arguments = settings.document, address, pool if hil or not alone else None
         plc = _Plc(partial(open_source, *source_arguments), label, complain, once=once)
         results = (
             show(name, settings.asset.type, asker_of(settings), plc.results_down) if show else None

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from drivers.connection_pool import ConnectionPool
 from drivers.modbus.settings import ModbusSettings
 from drivers.reconnect import RETRY_S, LostError
 
@@ -58,13 +59,9 @@ class Line:
             self.connection = None
 
 
-class ConnectionPool:
-    """The shared connections to all PLCs of a process."""
-
-    def __init__(self) -> None:
-        self._lines: dict[str, Line] = {}  # by the settings of the connection
-
-    def to(self, settings: ModbusSettings) -> Line:
-        """Give the one connection to this PLC, for all of its units."""
-        key = settings.model_dump_json(include={"host", "port", "timeout_ms", "tls"})
-        return self._lines.setdefault(key, Line())
+def line_to(settings: ModbusSettings, pool: ConnectionPool | None) -> Line | None:
+    """The one connection of a pool to this PLC, for all of its units; None without a pool."""
+    if pool is None:
+        return None
+    address = settings.model_dump_json(include={"host", "port", "timeout_ms", "tls"})
+    return pool.shared((settings.kind, address), Line)
