@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import uvicorn
-from accessible import violations
+from accessible import SCHEMES, violations_light_and_dark
 from page_site import LEAK, Run, S, config, write_config
 from playwright.sync_api import Browser, Locator, Page, expect
 from test_texts import catalogue
@@ -862,19 +862,18 @@ def _luminance(colour: str) -> float:
 
 @pytest.mark.slow
 @pytest.mark.needs("axe")
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
+def test_axe_finds_no_violation(site: Site) -> None:
     site.run.leak()
     site.run.suck(2.0)
     _kept_figures(site)
-    page = site.open("login", "phone", color_scheme=scheme, bypass_csp=True)
-    assert violations(page) == []
+    page = site.open("login", "phone", bypass_csp=True)
+    assert violations_light_and_dark(page) == []
     site.log_in(page)
     site.until_light(page, "red")
     expect(card(page)).to_be_visible()
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
     card(page).locator("summary").click()
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
     tabs = {
         "Trends": "#trend-plot canvas",
         "History": "#episodes article",
@@ -883,49 +882,46 @@ def test_axe_finds_no_violation(site: Site, scheme: str) -> None:
     for tab, seen in tabs.items():
         page.get_by_role("tab", name=tab).click()
         expect(page.locator(seen)).to_be_visible()
-        assert violations(page) == []
+        assert violations_light_and_dark(page) == []
     change_limit(site, page, "Longest t1", "700", "shorter cycle")
     expect(limit(page, "Longest t1")).to_contain_text("700 ms")
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
     limit(page, "Longest t1").get_by_role("button", name="Reset").click()
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
     page.keyboard.press("Escape")
     page.get_by_role("tab", name="Now").click()
     for button, dialog in (("Shelve", "#shelve"), ("Comment", "#comment")):
         card(page).get_by_role("button", name=button).click()
-        assert violations(page) == []
+        assert violations_light_and_dark(page) == []
         page.keyboard.press("Escape")
         expect(page.locator(dialog)).to_be_hidden()
 
 
 @pytest.mark.slow
 @pytest.mark.needs("axe")
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_violation_on_the_page_of_an_error(site: Site, scheme: str) -> None:
-    page = site.open("nothing-here", "phone", color_scheme=scheme, bypass_csp=True)
+def test_axe_finds_no_violation_on_the_page_of_an_error(site: Site) -> None:
+    page = site.open("nothing-here", "phone", bypass_csp=True)
     expect(page.get_by_role("heading", name="Not Found")).to_be_visible()
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
 
 
 @pytest.mark.slow
 @pytest.mark.needs("axe")
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site, scheme: str) -> None:
+def test_readings_of_a_run_that_has_ended_can_still_be_read(site: Site) -> None:
     site.run.suck(2.0)
-    page = site.open("", "phone", color_scheme=scheme, bypass_csp=True)
+    page = site.open("", "phone", bypass_csp=True)
     expect(page.locator("#measured")).to_have_text("600")
     site.runs.pop().close()
     expect(page.locator(".live")).to_have_class(re.compile(r"\bstale\b"))
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None:
+def test_gloves_find_everything_on_every_screen(site: Site) -> None:
     site.run.leak()
     site.run.suck(2.0)
     for size in SIZES:
-        page = site.open("login", size, color_scheme=scheme, has_touch=True)
+        page = site.open("login", size, has_touch=True)
         _is_fit(page)
         site.log_in(page)
         site.until_light(page, "red")
@@ -944,8 +940,14 @@ def test_gloves_find_everything_on_every_screen(site: Site, scheme: str) -> None
 def _is_fit(page: Page) -> None:
     """All there is to press is 44 pixels high and wide, and nothing is beside the screen.
 
-    No label runs into what is beside it.
+    No label runs into what is beside it. In the dark it is the same.
     """
+    for scheme in SCHEMES:
+        page.emulate_media(color_scheme=scheme)
+        _fits(page)
+
+
+def _fits(page: Page) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     spilt = page.evaluate(
         """() => [...document.querySelectorAll("button, .button")]

@@ -2,12 +2,13 @@
 
 import dataclasses
 import re
+import shutil
 import time
 from pathlib import Path
 
 import pytest
-from accessible import violations
-from page_site import S
+from accessible import violations_light_and_dark
+from page_site import S, config, write_config
 from playwright.sync_api import Locator, Page, expect
 from test_page_browser import SIZES, Site, _is_fit, site
 from test_page_curve import OURS, rows, write_log
@@ -22,23 +23,30 @@ LOGGED_S = 600.0
 PEAK_MBAR = 950.0
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def begin() -> int:
     """When the log began (UTC, ns)."""
     return time.time_ns() - AGO_S * S
 
 
-@pytest.fixture
-def logged(site: Site, begin: int) -> Site:
-    """A site whose run has logged ten minutes, with an alarm of that time that is over."""
-    run = site.run
-    folder = Path(run.config.document.name).parent
-    asset = run.config.asset
+@pytest.fixture(scope="module")
+def log(begin: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten minutes of the ejector of a site, with a peak of one row."""
+    folder = tmp_path_factory.mktemp("log")
+    asset = config(write_config(folder)).asset
     samples, ticks = rows(LOGGED_S, begin)
     samples["pressure"][301_234] = OURS.ambient - PEAK_MBAR * 100.0
     header = dataclasses.replace(OURS, asset_type=asset.type, asset_id=asset.id)
-    write_log(folder / "run.mcap", (samples, ticks), header)
-    remember(folder_of(run.config.document, asset), folder)
+    return write_log(folder / "run.mcap", (samples, ticks), header)
+
+
+@pytest.fixture
+def logged(site: Site, begin: int, log: Path) -> Site:
+    """A site whose run has logged ten minutes, with an alarm of that time that is over."""
+    run = site.run
+    folder = Path(run.config.document.name).parent
+    shutil.copy(log, folder)
+    remember(folder_of(run.config.document, run.config.asset), folder)
     shift = [begin + 300 * S]
     run.alarms._clock = lambda: shift[0]
     run.leak()
@@ -194,10 +202,9 @@ def test_without_logs_the_page_says_how_to_have_some(site: Site) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_screen_has_room_for_an_old_curve(logged: Site, scheme: str) -> None:
+def test_every_screen_has_room_for_an_old_curve(logged: Site) -> None:
     for size in SIZES:
-        page = logged.open("", size, color_scheme=scheme, has_touch=True)
+        page = logged.open("", size, has_touch=True)
         page.locator("article.alarm").get_by_role("button", name="Show its curve").click()
         loaded(page)
         _is_fit(page)
@@ -206,9 +213,8 @@ def test_every_screen_has_room_for_an_old_curve(logged: Site, scheme: str) -> No
 
 @pytest.mark.slow
 @pytest.mark.needs("axe")
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_violation_beside_an_old_curve(logged: Site, scheme: str) -> None:
-    page = logged.open("", "phone", color_scheme=scheme, bypass_csp=True)
+def test_axe_finds_no_violation_beside_an_old_curve(logged: Site) -> None:
+    page = logged.open("", "phone", bypass_csp=True)
     page.locator("article.alarm").get_by_role("button", name="Show its curve").click()
     loaded(page)
-    assert violations(page) == []
+    assert violations_light_and_dark(page) == []

@@ -4,16 +4,15 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 import rigs
-from accessible import violations
+from accessible import SCHEMES, violations_light_and_dark
 from calibrations import log_of
 from command_line import twin
 from PIL import Image
-from playwright.sync_api import Browser, ViewportSize
+from playwright.sync_api import Browser
 from test_fleet_report import some_of_all
 from test_report import explained
 from test_retelling import shape_of, written_in
@@ -32,8 +31,6 @@ from twin.signals import TICK
 
 PAGES = ("good", "usable", "refused", "fleet", "report")
 WIDTHS = (390, 820, 1400)
-Scheme = Literal["light", "dark"]
-SCHEMES: tuple[Scheme, ...] = ("light", "dark")
 GROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 18, 18)"}
 
 
@@ -164,29 +161,41 @@ def test_stored_sentences_of_these_pages_have_templates(
 
 @pytest.mark.slow
 @pytest.mark.needs("axe")
-@pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("code", ["en", "de"])
 def test_axe_finds_no_violation_and_no_width_is_too_small(
-    code: str, scheme: Scheme, tmp_path: Path, browser: Browser
+    code: str, tmp_path: Path, browser: Browser
 ) -> None:
     for name in PAGES:
-        url = page_of(name, code, tmp_path).as_uri()
+        page = browser.new_page()
+        page.goto(page_of(name, code, tmp_path).as_uri())
         for width in WIDTHS:
             at = name, width
-            size: ViewportSize = {"width": width, "height": 800}
-            page = browser.new_page(viewport=size, color_scheme=scheme)
-            page.goto(url)
+            page.set_viewport_size({"width": width, "height": 800})
             assert page.evaluate("document.documentElement.scrollWidth") <= width, at
             scrolled = page.evaluate(
                 "[...document.querySelectorAll('.wide, figure')]"
                 ".some(e => e.scrollWidth > e.clientWidth)"
             )
             assert not scrolled, at
-            assert (
-                page.evaluate("getComputedStyle(document.body).backgroundColor") == (GROUND[scheme])
-            )
-            assert violations(page) == [], at
-            page.close()
+            assert violations_light_and_dark(page) == [], at
+        for scheme in SCHEMES:
+            page.emulate_media(color_scheme=scheme)
+            ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+            assert ground == GROUND[scheme], (name, scheme)
+        page.close()
+
+
+@pytest.mark.needs("axe")
+def test_what_is_faint_in_the_dark_alone_is_found(browser: Browser) -> None:
+    page = browser.new_page()
+    colours = "body {background: #111} h1 {color: #fff} p {color: #333}"
+    dark = f"@media (prefers-color-scheme: dark) {{{colours}}}"
+    page.set_content(
+        f"<html lang=en><title>a</title><style>{dark}</style><main><h1>a</h1><p>words</p></main>"
+    )
+    found = violations_light_and_dark(page)
+    page.close()
+    assert [violation.split(": ")[:2] for violation in found] == [["dark", "color-contrast"]]
 
 
 @pytest.mark.slow
