@@ -58,6 +58,7 @@ def copies(ours: list[Path], installed: Path) -> dict[str, str]:
     return found
 
 
+@cache
 def digest(path: Path) -> bytes:
     return sha256(path.read_bytes()).digest()
 
