@@ -249,7 +249,7 @@ READ_OFF = """
 
 @pytest.mark.slow
 def test_an_unknown_rig_is_commissioned(tmp_path: Path) -> None:
-    rows = rigs.recorded("test_rig", 60.0)[0][::2]
+    rows = rigs.recorded("test_rig", 36.0)[0][::4]
     trace = [
         f"{(row['time_ns'] - rows['time_ns'][0]) / 1e6:.0f},{row['commands'] & 1},"
         f"{row['commands'] >> 1 & 1},{row['pressure'] / 100.0:.2f}\n"
