@@ -28,6 +28,8 @@ from twin.figures.text import limit_of
 from twin.figures.warnings import CAUTIONS, in_words, warnings
 from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, Ejector, Supply, System, Vessel
+from twin.monitor.healthy import Healthy
+from twin.monitor.healthy import Scatter as Seen
 from twin.monitor.monitor import MonitorSettings
 from twin.signals import Phase
 
@@ -511,6 +513,26 @@ def test_limits_are_the_units_where_nothing_is_set() -> None:
     found = limits(own, DATA, MonitorSettings())
     assert (found.leakage, found.free_flow, found.supply) == (90.0, 40.0, (3.0, 6.0))
     assert found.configured == {"leakage", "free_flow", "lowest_supply"}
+
+
+def commissioned(scatter: float) -> MonitorSettings:
+    """A monitor of a unit whose commissioning showed its figures, with a share as their scatter."""
+    means = {"t1": 400.0, "leakage": 60.0, "lowest_supply": 4.5, "highest_supply": 4.7}
+    seen = {name: Seen(mean=mean, sigma=scatter * mean) for name, mean in means.items()}
+    return MonitorSettings(healthy=Healthy(key_figures=seen))
+
+
+def test_limits_come_from_the_commissioned_unit_where_it_showed_the_figure() -> None:
+    """A tight unit leaks far less than any ejector permits: its limit is as near to that."""
+    found = limits(FigureSettings(), DATA, commissioned(scatter=0.001))
+    assert (found.t1, found.leakage) == (500.0, 75.0)
+    assert found.supply == pytest.approx((0.75 * 4.5, 1.25 * 4.7))
+    assert found.free_flow == 540.0  # no cycle showed it
+    wider = limits(FigureSettings(), DATA, commissioned(scatter=0.1))
+    assert wider.leakage > 2.0 * 60.0
+    assert wider.t1 > 2.0 * 400.0
+    set_here = limits(FigureSettings(permitted_t1_ms=900.0), DATA, commissioned(scatter=0.001))
+    assert set_here.t1 == 900.0
 
 
 def test_a_porous_part_has_a_limit_of_its_own() -> None:

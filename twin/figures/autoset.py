@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.errors import ConfigError
 from twin.figures.database import History
-from twin.figures.settings import LEAST_LEAKAGE, LEAST_T1_MS, permitted
+from twin.figures.settings import LEAST, permitted
 
 GOOD_CYCLES = 5  # the last ones; earlier ones say nothing of today
 
@@ -43,7 +43,7 @@ def autoset(history: History, tolerance: float) -> Autoset:
         )
     worst_t1, worst_leakage = float(t1[good].max()), max(float(leakage[good].max()), 0.0)
     return Autoset(
-        permitted_t1_ms=permitted(worst_t1, tolerance, LEAST_T1_MS),
-        permitted_leakage_mbar_s=permitted(worst_leakage, tolerance, LEAST_LEAKAGE),
+        permitted_t1_ms=permitted(worst_t1, tolerance, LEAST["t1"]),
+        permitted_leakage_mbar_s=permitted(worst_leakage, tolerance, LEAST["leakage"]),
         cycles=len(good),
     )

@@ -1,6 +1,7 @@
 """The table ``[figures]``: permitted values, and where key figures are kept."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Self
 
@@ -15,25 +16,25 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.monitor import MonitorSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
-LEAST_T1_MS = 50.0  # least margin over the usual: less is scatter
-LEAST_LEAKAGE = 10.0  # mbar/s, the same
-LEAST_SUPPLY_BAR = 0.5  # the same
-LIMITED = ("t1", "leakage", "free_flow", "lowest_supply", "highest_supply")
-NOWHERE = math.inf, -math.inf
+LOWEST = "lowest_supply"  # the figure whose limit is a lower one
+# Least margin to the usual, in the figure's unit: less is not worth a warning. Chosen.
+LEAST = {"t1": 50.0, "leakage": 10.0, LOWEST: 0.5, "highest_supply": 0.5}
+LIMITED = ("t1", "leakage", "free_flow", LOWEST, "highest_supply")
 SHORTEST_CYCLE_S = 1.0  # cycle time for which false alarms are budgeted; longer ones give fewer
 
 
 class FigureSettings(DatabaseSettings):
     """What is permitted in a cycle, the field's defaults; and whether figures are kept."""
 
-    # Longest t1; by default the data set's, with the tolerance.
+    # Longest t1; by default the commissioned unit's, else the data set's, with the tolerance.
     permitted_t1_ms: Positive | None = None
-    # Largest leakage; by default the data set's with the tolerance, at least what the ejector
-    # permits.
+    # Largest leakage; by default the commissioned unit's with the tolerance. Else the data set's,
+    # at least what the ejector permits.
     permitted_leakage_mbar_s: Positive | None = None
     permitted_free_flow_mbar: Positive | None = None  # where the ejector would report a part
     supply_low_bar: Annotated[float, Field(ge=0.0)] | None = None  # gauge, at the nozzle
-    supply_high_bar: Positive | None = None  # both as the data set has it, and the tolerance
+    # Both by default the commissioned unit's, else the data set's, with the tolerance.
+    supply_high_bar: Positive | None = None
     energy_kwh_m3: Positive = 0.12  # to compress a standard cubic metre, whole compressor station
     # Price of electric energy in the currency; or set price_per_m3.
     price_per_kwh: Positive | None = None
@@ -108,11 +109,12 @@ def limits_of(config: Config) -> Limits:
 
 
 def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> Limits:
-    """The limits of a unit: those not set follow from its data set.
+    """The limits of a unit: those not set follow from its commissioning, else from its data set.
 
     They keep such a distance that healthy cycles exceed them no more often than ``watch`` permits.
     """
-    reach = dict.fromkeys(LIMITED, NOWHERE) | healthy_range(watch.healthy, watch.false_alarm_days)
+    reach = healthy_range(watch.healthy, watch.false_alarm_days)
+    own = _of_commissioning(watch.healthy, reach, settings.autoset_tolerance)
     t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
     free_flow = settings.permitted_free_flow_mbar
     low, high = settings.supply_low_bar, settings.supply_high_bar
@@ -120,24 +122,50 @@ def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> L
         "t1": t1,
         "leakage": leakage,
         "free_flow": free_flow,
-        "lowest_supply": low if high is None else high,
+        LOWEST: low if high is None else high,
     }
-    ejector, tolerance, nozzle_bar = (
-        data.ejector,
-        settings.autoset_tolerance,
-        data.supply.nozzle_bar,
-    )
+    usual = _of_data_set(data, settings.autoset_tolerance)
     if t1 is None:
-        t1 = max(permitted(t1_from_rest(data), tolerance, LEAST_T1_MS), reach["t1"][1])
+        t1 = own.get("t1", usual.t1)
     if leakage is None:
-        usual = permitted(leakage_from_rest(data), tolerance, LEAST_LEAKAGE)
-        leakage = max(usual, ejector.permitted_leakage_mbar_s, reach["leakage"][1])
+        leakage = own.get("leakage", usual.leakage)
     if free_flow is None:
-        free_flow = max(ejector.h2_mbar - ejector.h2_hysteresis_mbar, reach["free_flow"][1])
+        free_flow = max(usual.free_flow, *reach.get("free_flow", (-math.inf, -math.inf)))
     if low is None:
-        low = nozzle_bar - max(tolerance * nozzle_bar, LEAST_SUPPLY_BAR)
-        low = min(low, reach["lowest_supply"][0])
+        low = own.get(LOWEST, usual.supply[0])
     if high is None:
-        high = max(permitted(nozzle_bar, tolerance, LEAST_SUPPLY_BAR), reach["highest_supply"][1])
+        high = own.get("highest_supply", usual.supply[1])
     configured = frozenset(name for name, value in chosen.items() if value is not None)
     return Limits(t1, leakage, free_flow, (low, high), configured)
+
+
+def _of_commissioning(
+    healthy: Healthy, reach: Mapping[str, tuple[float, float]], tolerance: float
+) -> dict[str, float]:
+    """Limits of the key figures that the commissioning's cycles showed.
+
+    A limit is the mean of these cycles and the tolerance, or ``reach`` where healthy cycles scatter
+    more. That of the lowest supply is a lower one.
+    """
+    own = {}
+    for name in LEAST.keys() & reach.keys():
+        usual, (low, high) = healthy.key_figures[name].mean, reach[name]
+        beyond = permitted(usual, tolerance, LEAST[name])
+        own[name] = min(low, 2.0 * usual - beyond) if name == LOWEST else max(high, beyond)
+    return own
+
+
+def _of_data_set(data: DataSet, tolerance: float) -> Limits:
+    """Limits of a unit whose cycles nobody has seen: what its data set expects, and the tolerance.
+
+    Leakage may be at least what the ejector permits, and a free-flow vacuum is below H2.
+    """
+    ejector, nozzle_bar = data.ejector, data.supply.nozzle_bar
+    leakage = permitted(leakage_from_rest(data), tolerance, LEAST["leakage"])
+    highest = permitted(nozzle_bar, tolerance, LEAST[LOWEST])
+    return Limits(
+        permitted(t1_from_rest(data), tolerance, LEAST["t1"]),
+        max(leakage, ejector.permitted_leakage_mbar_s),
+        ejector.h2_mbar - ejector.h2_hysteresis_mbar,
+        (2.0 * nozzle_bar - highest, highest),
+    )
