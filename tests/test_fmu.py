@@ -155,6 +155,7 @@ def test_what_a_diagnosis_found_is_where_the_effects_start() -> None:
         ("suction_nozzle_on_slowly", {"loss": 40.0, "sets_in": 1.0, "fades": 2.0}),
         ("opening_above", {"sonic_flow": 3.0, "begins": 400.0, "ends_below": 100.0}),
         ("supply_swinging", {"drop": 1.0, "period": 0.7, "shift": 0.1}),
+        ("supply_pulsed", {"drop": 1.0, "period": 0.7, "duty": 35.0, "shift": 0.1}),
     ],
 )
 def test_a_mechanism_of_the_data_set_is_in_the_fmu(
@@ -201,6 +202,13 @@ BENT = entry(
 SWING = entry(
     "supply_swinging", drop=(-2.0, 0.7, 2.0), period=(0.3, 1.7, 9.0), shift=(0.0, 0.3, 120.0)
 )
+PULSE = entry(
+    "supply_pulsed",
+    drop=(-2.0, 0.7, 2.0),
+    period=(0.3, 1.7, 9.0),
+    duty=(2.0, 40.0, 98.0),
+    shift=(0.0, 0.3, 120.0),
+)
 
 
 @pytest.mark.needs("cc")
@@ -214,6 +222,7 @@ SWING = entry(
         (CUP, {"volume_at_full_vacuum": 80.0}),  # more than the cup has: both limit it
         pytest.param(BENT, {"pressure_drop_at_nominal": 200.0}, marks=pytest.mark.slow),
         pytest.param(SWING, {"drop": 0.9}, marks=pytest.mark.slow),
+        pytest.param(PULSE, {"drop": 0.9, "duty": 60.0}, marks=pytest.mark.slow),
     ],
     ids=lambda of: of.mechanism if isinstance(of, CatalogueEffect) else "",
 )

@@ -144,6 +144,24 @@ def test_a_relay_begins_at_one_vacuum_and_ends_at_another() -> None:
     assert vacuum[acts[-1]] == pytest.approx(300.0, abs=40.0)
 
 
+def test_a_pulse_is_on_for_its_duty_from_its_shift_on() -> None:
+    """Its edges lie between rows: each row has the mean of its millisecond."""
+    theta = rigs.theta("test_rig")
+    values = {"offset": 10.0, "period": 0.5, "duty": 30.0, "shift": 0.1004}
+    pulsed = m.Mechanism(m.PLACES["sensor"], m.WHENS["pulsed"])
+    m.Mechanism._act(pulsed, theta, *(values[p.name] for p in pulsed.effect.parameters))
+    on = (run(theta)[0] - run(rigs.theta("test_rig"))[0]) / (10.0 * MBAR)
+    time = np.cumsum(DT)
+    phase = ((time - 0.5 * DT - 0.1004) / 0.5) % 1.0
+    inside = np.abs(phase - 0.15) < 0.15 - 0.002
+    outside = np.abs(phase - 0.65) < 0.35 - 0.002
+    assert on[inside] == pytest.approx(1.0, abs=1e-6)
+    assert on[outside] == pytest.approx(0.0, abs=1e-6)
+    first = slice(90, 110)
+    assert on[first].sum() == pytest.approx(110 - 100.4 - 1.0, abs=1.01)
+    assert on[101:1101].mean() == pytest.approx(0.3, abs=1e-6)  # two periods
+
+
 def test_two_mechanisms_act_at_once_and_a_third_is_refused() -> None:
     one = with_mechanism("opening_nozzle_on")
     two = with_mechanism("sensor_nozzle_off", theta=one)
@@ -349,6 +367,26 @@ def test_what_swings_is_not_stored_and_is_judged_on_another_log_in_phase_with_th
     judged = judged_on(diagnosis, config, "other.mcap", [late[850:]])  # half a period later
     assert judged is not None
     assert judged["extended"]["rms_mbar"] < 0.8 * judged["baseline"]["rms_mbar"]
+
+
+@cache
+def pulsed() -> tuple[Evidence, Explained]:
+    """A second ejector takes 0.7 bar from a gripper's supply, for two fifths of every 2.9 s."""
+    samples, _ = rigs.recorded("gripper", 24.0, ("second_ejector=0.7",), 3)
+    evidence = collect(rigs.config("gripper"), [samples])
+    explained = explain_alone(evidence, evidence.judged[::2], HEALTHY, lambda _: None)
+    assert explained is not None
+    return evidence, explained
+
+
+@pytest.mark.slow
+def test_a_second_ejector_is_named_with_its_period_its_duty_and_its_size() -> None:
+    _, explained = pulsed()
+    assert explained.cause.effect == "supply_pulsed"
+    assert explained.cause.values["period"] == pytest.approx(2.9, rel=0.005)
+    assert explained.cause.values["duty"] == pytest.approx(40.0, abs=4.0)
+    assert explained.cause.values["drop"] == pytest.approx(0.7, rel=0.15)
+    assert not any(rival.effect.endswith("_swinging") for rival in explained.rivals)
 
 
 @pytest.mark.parametrize(

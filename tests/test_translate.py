@@ -68,7 +68,7 @@ def counted(a: float, b: float) -> float:
 def whole_numbers(a: float, b: float) -> float:
     bits = int(a) & 6 | (1 if b > 0.0 else 0)
     steps = min(max(math.ceil(abs(b)), 1), 5)
-    return bits / steps + steps
+    return bits / steps + steps + math.floor(b) * 0.5
 
 
 def logs(a: float, b: float) -> float:

@@ -46,7 +46,7 @@ RIGHT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "lip_lift": (AIR, ("above", "beyond", "beyond_slowly")),
     "lifting_lip": (AIR, ("above", "beyond", "beyond_slowly")),
     "supply_swing": (("supply",), ("swinging",)),
-    "second_ejector": (("supply",), ("swinging",)),
+    "second_ejector": (("supply",), ("pulsed",)),
     "nozzle_icing": (("suction", "nozzle", "supply"), ("nozzle_on_slowly",)),
     "filling_silencer": (("end_pressure", "nozzle"), ("nozzle_on_slowly",)),
     "creeping_cup": (("volume",), ("beyond_slowly", "nozzle_on_slowly")),
@@ -70,6 +70,7 @@ CONDENSATE = {
 SIZES = {
     "lip_lift": {"opening": "sonic_flow", "inflow": "flow"},
     "supply_swing": {"supply": "drop"},
+    "second_ejector": {"supply": "drop"},
     "filling_silencer": {"end_pressure": "end_pressure_rise"},
     "creeping_cup": {"volume": "volume_at_full_vacuum"},
     "blow_off_valve_leak": {"inflow": "flow"},

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis, insufficient
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, read_again, read_cycles
-from twin.diagnosis.extend import extended, swings
+from twin.diagnosis.extend import extended, has_rhythm
 from twin.diagnosis.held_out import Judged, gain, judge
 from twin.diagnosis.residual_covariance import covariance
 from twin.errors import ConfigError, SourceError
@@ -46,13 +46,13 @@ def judged_on(
 
     All whole cycles of the log count, whatever their program. ``there`` is the configuration under
     the conditions of that log (``conditions``). Intermittent causes are left out, and so are curves
-    from data if the program is another: ``left_out`` says so. What swings begins anew in each log:
+    from data if the program is another: ``left_out`` says so. A rhythm begins anew in each log:
     every second cycle shows its phase, the others judge. Raises SourceError if the log has no cycle
     to judge by.
     """
     extended_model = extended(diagnosis, config)
-    swinging = tuple(filter(swings, diagnosis.acting))
-    if extended_model is None and not swinging:
+    rhythmic = tuple(filter(has_rhythm, diagnosis.acting))
+    if extended_model is None and not rhythmic:
         return None
     blocks, there = read_again(blocks), there or config
     read_before = read_cycles(there, blocks)
@@ -72,9 +72,9 @@ def judged_on(
     if reason := insufficient(read_after, after):
         raise SourceError(_nothing_judged(log, reason))
     cycles = sorted({*before.judged} & {*after.judged})
-    if swinging:
-        swinging, cycles = (_in_phase(after, cycles[::2], swinging[0]),), cycles[1::2]
-    as_it_stands, with_causes = _judged(before, cycles), _judged(after, cycles, swinging)
+    if rhythmic:
+        rhythmic, cycles = (_in_phase(after, cycles[::2], rhythmic[0]),), cycles[1::2]
+    as_it_stands, with_causes = _judged(before, cycles), _judged(after, cycles, rhythmic)
     return {
         "log": log,
         "cycles": len(cycles),
@@ -167,12 +167,12 @@ def program(evidence: Evidence) -> Floats:
     return medians
 
 
-def _judged(evidence: Evidence, cycles: list[int], swinging: Hypothesis = HEALTHY) -> Judged:
-    return judge(evidence, covariance(evidence, swinging).of(cycles), swinging)
+def _judged(evidence: Evidence, cycles: list[int], rhythmic: Hypothesis = HEALTHY) -> Judged:
+    return judge(evidence, covariance(evidence, rhythmic).of(cycles), rhythmic)
 
 
 def _in_phase(evidence: Evidence, cycles: list[int], cause: Cause) -> Cause:
-    """The swinging cause with the phase that suits some cycles of a log best."""
+    """The rhythmic cause with the phase that suits some cycles of a log best."""
     period = cause.values["period"]
     shifts = np.linspace(0.0, period, PHASES, endpoint=False)
     causes = [replace(cause, values={**cause.values, "shift": float(s)}) for s in shifts]

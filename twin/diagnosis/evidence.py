@@ -183,6 +183,11 @@ class Evidence:
         return np.cumsum(time_steps(self.samples))
 
     @cached_property
+    def clock(self) -> Floats:
+        """Time (s) at each row that the kernel has counted since the first: breaks do not count."""
+        return np.cumsum(np.maximum(time_steps(self.samples), 0.0))
+
+    @cached_property
     def _measured(self) -> Floats:
         """Mean measured pressure (Pa) of each bin."""
         return self.bins.mean(self.samples["pressure"].astype(np.float64))

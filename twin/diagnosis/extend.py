@@ -24,7 +24,7 @@ from twin.model.catalogue import mechanism_of
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Parameter, apply, effect_of
-from twin.model.mechanism import MECHANISMS, SWINGING
+from twin.model.mechanism import MECHANISMS, RHYTHMIC
 from twin.model.term import AGAIN
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
@@ -67,8 +67,8 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
         elif cause.course == Course.RAMP:
             rates = (f"{p['value']:.3g} {p['unit']}" for p in answer["parameters"].values())
             yield f"{name} goes on growing ({', '.join(rates)}): it is stored as it was at the end"
-    if any(map(swings, diagnosis.acting)):
-        yield "what swings begins anew in each recording: it is not stored"
+    if any(map(has_rhythm, diagnosis.acting)):
+        yield "what has a rhythm of its own begins anew in each recording: it is not stored"
     if diagnosis.terms:
         yield (
             "the curve from data holds for this program of commands only, and is added to any:"
@@ -80,8 +80,8 @@ def remarks(diagnosis: Diagnosis) -> Iterator[str]:
 
 def nothing(diagnosis: Diagnosis) -> str:
     """The reason why there is no extended model."""
-    if any(map(swings, diagnosis.acting)):
-        return "what swings has another phase in each recording"
+    if any(map(has_rhythm, diagnosis.acting)):
+        return "what has a rhythm of its own has another phase in each recording"
     return {
         "consistent": "the data set there is fits already",
         "insufficient": "the log cannot answer",
@@ -121,14 +121,14 @@ def store(
 # --- sizes ----------------------------------------------------------------------------------------
 
 
-def swings(cause: Cause) -> bool:
+def has_rhythm(cause: Cause) -> bool:
     """Whether a cause has a rhythm of its own. Nobody knows its phase in another log."""
     mechanism = MECHANISMS.get(mechanism_of(cause.effect))
-    return mechanism is not None and mechanism.when.code == SWINGING
+    return mechanism is not None and mechanism.when.code in RHYTHMIC
 
 
 def _is_lasting(cause: Cause) -> bool:
-    return cause.course != Course.INTERMITTENT and not swings(cause)
+    return cause.course != Course.INTERMITTENT and not has_rhythm(cause)
 
 
 def _lasting_causes(diagnosis: Diagnosis) -> Iterator[tuple[str, Sizes]]:

@@ -195,7 +195,7 @@ def _driven(diagnosed: Found, mechanism: m.Mechanism) -> tuple[Floats, Floats, s
     if code in (m.ABOVE, m.BEYOND):
         vacuum = (float(evidence.theta[c.AMBIENT]) - states[kernel.VESSEL]) / MBAR
         return vacuum, share, tr("vacuum in the vessel (mbar below ambient)")
-    if code == m.SWINGING:
+    if code in m.RHYTHMIC:
         values = hypothesis[-1].values
         phase = (states[kernel.RUN] - values["shift"]) % values["period"]
         return phase, share, tr("time in the rhythm (s)")

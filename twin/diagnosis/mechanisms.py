@@ -14,12 +14,13 @@ from scipy.optimize import lsq_linear
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
 from twin.diagnosis.residual_covariance import ResidualWhitener, covariance
+from twin.diagnosis.rhythms import rhythmic_starts
 from twin.inference.levels import CHI2_999
 from twin.model import theta as c
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause
 from twin.model.effects import effect_of
-from twin.model.mechanism import ABOVE, ALWAYS, MECHANISMS, SWINGING, Mechanism
+from twin.model.mechanism import ABOVE, ALWAYS, MECHANISMS, RHYTHMIC, Mechanism
 from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 
@@ -52,13 +53,6 @@ APART = 0.5
 # A threshold is crossed between two rows, so the misfit is a step function of it, and a fit stops
 # at a step. Changes of thresholds (in typical sizes) that are tried from there, and rounds of it.
 AFAR, LEAPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0), 4
-# The periodogram has frequencies half a line width (1 / duration) apart: a fit that begins farther
-# from a line does not reach it. MOST_FREQUENCIES bounds the computing time; on a long log the
-# fastest rhythms are then not searched.
-PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 400, 3
-# Least share of the squared deviation (mbar) that differs from cycle to cycle, for a search for
-# rhythms. Chosen: a swinging supply has 0.3 to 0.8; leaks, vapour and ice up to 0.06.
-DIFFERS = 0.1
 # Groups of coefficients with the same meaning for a plant: inflows, and resistances of the line.
 ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
 
@@ -232,13 +226,10 @@ def _promising(
     starts = [
         _Start(mechanism, shape)
         for mechanism in MECHANISMS.values()
-        if mechanism.when.code != SWINGING
+        if mechanism.when.code not in RHYTHMIC
         for shape in mechanism.when.starts
     ]
-    if _differs(evidence, weights, causes) > DIFFERS:
-        for mechanism in MECHANISMS.values():
-            if mechanism.when.code == SWINGING:
-                starts += _rhythms(evidence, weights, residuals, causes, mechanism)
+    starts += [_Start(*start) for start in rhythmic_starts(evidence, weights, causes)]
     probes = PROBES if float(np.mean(residuals**2)) > GROSS**2 else PROBES[:1]
     gains, sizes = _linear(evidence, weights, residuals, causes, starts * len(probes), probes)
     starts *= len(probes)
@@ -308,50 +299,6 @@ def _linear(
         sizes.append(size * probe)
         gains.append(float(residuals @ residuals - np.sum((residuals + secants @ size) ** 2)))
     return np.array(gains), sizes
-
-
-def _differs(evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis) -> float:
-    """Share of the squared deviation (mbar) that is not the same in each cycle, 0 to 1."""
-    off, count = evidence.off([causes])[weights.bins, 0], evidence.bins.count[weights.bins]
-    _, place = np.unique(evidence.bins.place[weights.bins], return_inverse=True)
-    mean = np.bincount(place, off * count) / np.bincount(place, count)
-    return float(np.sum(count * (off - mean[place]) ** 2) / max(np.sum(count * off**2), 1e-9))
-
-
-def _rhythms(
-    evidence: Evidence,
-    weights: ResidualWhitener,
-    residuals: Floats,
-    causes: Hypothesis,
-    mechanism: Mechanism,
-) -> list[_Start]:
-    """Starts of a periodic mechanism at the highest peaks of the residuals' periodogram.
-
-    It fits the simulated responses to sines and cosines, so cycles may interrupt the rhythm.
-    """
-    (size,), (period, _) = mechanism.place.parameters, mechanism.when.parameters
-    duration = float(evidence.seconds[-1] - evidence.seconds[0])
-    slowest, step = 1.0 / min(duration, period.high), 1.0 / (PER_LINE * duration)
-    fastest = min(1.0 / period.low, slowest + step * MOST_FREQUENCIES)
-    frequencies = np.arange(slowest, fastest, step)
-    names = [parameter.name for parameter in mechanism.effect.parameters]
-    tried = [
-        (*causes, Cause(mechanism.name, dict(zip(names, values, strict=True))))
-        for frequency in frequencies
-        for values in ((size.typical, 1.0 / frequency, part / frequency) for part in (0.0, 0.25))
-    ]
-    moves = white(evidence, weights, tried) - residuals[:, None]
-    gains, shifts = np.empty(len(frequencies)), np.empty(len(frequencies))
-    for i, frequency in enumerate(frequencies):
-        waves = moves[:, 2 * i : 2 * i + 2]  # sin(wt), and sin(wt - 90 degrees) = -cos(wt)
-        (sine, cosine), *_ = np.linalg.lstsq(waves, -residuals, rcond=None)
-        left = residuals + waves @ (sine, cosine)
-        gains[i] = residuals @ residuals - left @ left
-        shifts[i] = np.arctan2(cosine, sine) % (2.0 * np.pi) / (2.0 * np.pi * frequency)
-    around = np.pad(gains, 1, constant_values=-np.inf)
-    peaks = np.flatnonzero((gains >= around[:-2]) & (gains >= around[2:]))
-    highest = peaks[np.argsort(-gains[peaks])[:PEAKS]]
-    return [_Start(mechanism, (1.0 / float(frequencies[i]), float(shifts[i]))) for i in highest]
 
 
 def _explained(

@@ -123,14 +123,14 @@ def _in_slot(program: Program, slot: InSlot, values: Mapping[str, str]) -> list[
             f"    theta[{first + where}] = {coefficient}.0;",
             f"    theta[{first + where + 1}] = {limit}(theta, {coefficient}, {added});",
         ]
-    kinds = (ROWS, WHOLE, *[NUMBER] * 6)
-    function = program.function(mechanism.set_condition, *kinds).name
-    condition = ", ".join(acting.condition(values, "0.0"))
-    return [
-        *lines,
-        f"    theta[{first + mechanism.WHEN}] = {acting.when.code}.0;",
-        f"    {function}(theta, {first}, {condition});",
-    ]
+    lines.append(f"    theta[{first + mechanism.WHEN}] = {acting.when.code}.0;")
+    for set_values, given in (
+        (mechanism.set_condition, acting.condition(values, "0.0")),
+        (mechanism.set_rhythm, acting.rhythm(values, "0.0")),
+    ):
+        function = program.function(set_values, ROWS, WHOLE, *[NUMBER] * len(given)).name
+        lines.append(f"    {function}(theta, {first}, {', '.join(given)});")
+    return lines
 
 
 def _at_rest() -> str:

@@ -40,20 +40,21 @@ from twin.exchange.c_expressions import (
 PRELUDE = """\
 static double lesser(double a, double b) { return b < a ? b : a; }
 static double greater(double a, double b) { return b > a ? b : a; }
-static int whole(double x) { return x > -1e9 ? (x < 1e9 ? (int)x : 1000000000) : -1000000000; }
+static int to_whole(double x) { return x > -1e9 ? (x < 1e9 ? (int)x : 1000000000) : -1000000000; }
 """
 
 # Functions of Python and NumPy that take one value.
 _CALLED: Mapping[object, tuple[str, Kind]] = {
     math.sqrt: ("sqrt({})", NUMBER),
     math.sin: ("sin({})", NUMBER),
-    math.ceil: ("whole(ceil({}))", WHOLE),
+    math.ceil: ("to_whole(ceil({}))", WHOLE),
+    math.floor: ("to_whole(floor({}))", WHOLE),
     math.isnan: ("isnan({})", WHOLE),
     np.log: ("log({})", NUMBER),
     np.exp: ("exp({})", NUMBER),
     abs: ("fabs({})", NUMBER),
     float: ("{}", NUMBER),
-    int: ("whole({})", WHOLE),
+    int: ("to_whole({})", WHOLE),
 }
 _BINARY: Mapping[type[ast.operator], tuple[str, int]] = {
     ast.Add: ("+", 2),

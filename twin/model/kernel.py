@@ -30,6 +30,7 @@ from twin.model.mechanism import (
     ALWAYS,
     BEGINS,
     BEYOND,
+    DUTY,
     ENDS,
     FADES,
     GATHERED,
@@ -37,6 +38,7 @@ from twin.model.mechanism import (
     NOZZLE_ON,
     ON,
     PERIOD,
+    PULSED,
     SETS_IN,
     SHIFT,
     SIZE,
@@ -444,6 +446,7 @@ def _mechanism_drives(state: State, k: Prepared, slot: int, i: int) -> tuple[flo
     beyond = min(max((vacuum - begins) / (ambient - begins), 0.0), 1.0)
     drive = 1.0 if when == ALWAYS else 0.0
     drive = 1.0 if when == SWINGING else drive
+    drive = 1.0 if when == PULSED else drive
     drive = jet if when == NOZZLE_ON else drive
     drive = jet if when == GATHERED else drive
     drive = 1.0 - jet if when == NOZZLE_OFF else drive
@@ -452,6 +455,30 @@ def _mechanism_drives(state: State, k: Prepared, slot: int, i: int) -> tuple[flo
     drive = beyond if when == BEYOND else drive
     drive = 1.0 - beyond if when == USED_UP else drive
     return drive, min(state[BLOWING, i], 1.0) if when == GATHERED else 1.0 - drive
+
+
+@inlined
+def _wave(k: Prepared, first: int, time: float, h: float, i: int) -> float:
+    """Factor (-1 to 1) of the mechanism at ``first`` in the step of ``h`` seconds from ``time`` on.
+
+    One that is on and off has its mean over the step: the deviation is then continuous in the
+    instants at which it switches, and a fit finds them. 1 for a mechanism without a rhythm.
+    """
+    when, begin = k[first + WHEN, i], (time - k[first + SHIFT, i]) / k[first + PERIOD, i]
+    length = h / k[first + PERIOD, i]
+    if when == SWINGING:
+        return math.sin(2.0 * math.pi * (begin + 0.5 * length))
+    if when == PULSED:
+        end, duty = begin + length, k[first + DUTY, i]
+        return (_periods_on(end, duty) - _periods_on(begin, duty)) / length
+    return 1.0
+
+
+@inlined
+def _periods_on(periods: float, duty: float) -> float:
+    """Sum (in periods) of the time until ``periods`` for which a pulse is on, from 0 on."""
+    whole = math.floor(periods)
+    return whole * duty + min(periods - whole, duty)
 
 
 @inlined
@@ -465,9 +492,8 @@ def _advance_mechanism(state: State, k: Prepared, slot: int, h: float, i: int) -
     rise = drive / max(k[first + SETS_IN, i], AT_ONCE)
     rate = rise + fade / max(k[first + FADES, i], AT_ONCE)
     target = rise / rate if rate > 0.0 else share
-    periods = (state[RUN, i] + 0.5 * h - k[first + SHIFT, i]) / k[first + PERIOD, i]
-    swing = math.sin(2.0 * math.pi * periods) if k[first + WHEN, i] == SWINGING else 1.0
-    state[ACTS + slot, i] = swing * (target + (share - target) * np.exp(-0.5 * rate * h))
+    wave = _wave(k, first, state[RUN, i], h, i)
+    state[ACTS + slot, i] = wave * (target + (share - target) * np.exp(-0.5 * rate * h))
     state[SET_IN + slot, i] = target + (share - target) * np.exp(-rate * h)
 
 

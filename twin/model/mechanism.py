@@ -1,7 +1,7 @@
 """Mechanisms, which act beside the table of effects: coefficients that change under a condition.
 
 A mechanism has a *place* (a coefficient: a flow into the vessel, a share of suction, a volume, the
-sensor), a *condition* (always, while the nozzle runs, above a vacuum, periodically) and a *speed*
+sensor), a *condition* (always, while the nozzle runs, above a vacuum, in a rhythm) and a *speed*
 (at once, or setting in and fading with time constants, like ice, water and warmth). Its share runs
 from 0 to 1; the coefficient changes by ``SIZE`` times the share. A mechanism has a state, so it
 holds for every program of commands.
@@ -21,11 +21,12 @@ _Value = TypeVar("_Value", float, str)  # of a parameter: a number, or its expre
 
 SLOTS = 2  # number of mechanisms that can act at once
 # Offsets of a mechanism's coefficients from ``c.MECHANISMS`` on; each mechanism has WIDTH of them.
-ON, SIZE, ALSO_ON, ALSO_SIZE, WHEN, BEGINS, ENDS, SETS_IN, FADES, PERIOD, SHIFT = range(11)
+ON, SIZE, ALSO_ON, ALSO_SIZE, WHEN, BEGINS, ENDS, SETS_IN, FADES, PERIOD, SHIFT, DUTY = range(12)
 WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
 # When it acts: always; while the nozzle runs; while it does not; in blow-off; above one vacuum
 # until below another; in proportion to the vacuum above a threshold; gathered while the nozzle runs
-# and cleared by blow-off; renewed at ambient pressure and used up by vacuum; periodically.
+# and cleared by blow-off; renewed at ambient pressure and used up by vacuum; to and fro in a rhythm
+# of its own; on and off in one.
 (
     ALWAYS,
     NOZZLE_ON,
@@ -36,7 +37,9 @@ WIDTH = (len(c.COEFFICIENTS) - c.MECHANISMS) // SLOTS
     GATHERED,
     USED_UP,
     SWINGING,
-) = range(9)
+    PULSED,
+) = range(10)
+RHYTHMIC = (SWINGING, PULSED)  # with a period and a phase, which no command sets
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,7 @@ _SETS_IN = _P("sets_in", "s", 0.02, 600.0, 1.5, ratio=True)
 _FADES = _P("fades", "s", 0.02, 600.0, 1.5, ratio=True)
 _PERIOD = _P("period", "s", 0.2, 120.0, 1.1, ratio=True)
 _SHIFT = _P("shift", "s", 0.0, 120.0, 0.2, is_of_the_log=True)
+_DUTY = _P("duty", "%", 2.0, 98.0, 5.0)
 
 PLACES = {
     place.name: place
@@ -352,12 +356,25 @@ WHENS = {
             "share = sin(2 pi (t - {shift}) / {period})",
             "to and fro",
         ),
+        When(
+            "pulsed",
+            PULSED,
+            (_PERIOD, _DUTY, _SHIFT),
+            ((1.3, 40.0, 0.0),),
+            "on and off with a period of {period}, on for {duty} of it",
+            "share = 1 for {duty} of each period of {period}, first from t = {shift} on; else 0",
+            "on and off in a rhythm of its own",
+        ),
     )
 }
 _SIGNED = {c.INFLOW, c.SENSOR_OFFSET}  # coefficients that may be negative
 # Conditions that only some places have. At other places, mechanisms that always act are effects of
 # the table; a period comes from a compressor or from another consumer.
-_ONLY = {"always": {"inflow"}, "swinging": {"supply", "inflow"}}
+_ONLY = {
+    "always": {"inflow"},
+    "swinging": {"supply", "inflow"},
+    "pulsed": {"supply", "inflow"},
+}
 # Conditions that a place lacks, because a log would not show them.
 _NOT = {
     "nozzle": {"nozzle_off", "in_blow_off"},
@@ -431,6 +448,7 @@ class Mechanism:
             theta[first + where + 1] = limit_of(coefficient)(theta, coefficient, si(theta, value))
         theta[first + WHEN] = self.when.code
         set_condition(theta, first, *self.condition(by_name, 0.0))
+        set_rhythm(theta, first, *self.rhythm(by_name, 0.0))
 
     def condition(self, values: Mapping[str, _Value], zero: _Value) -> tuple[_Value, ...]:
         """Last arguments of ``set_condition``; ``zero`` where it has no such parameter.
@@ -443,9 +461,11 @@ class Mechanism:
             values.get("ends_below", zero),
             sets_in,
             values.get("fades", sets_in),
-            values.get("period", zero),
-            values.get("shift", zero),
         )
+
+    def rhythm(self, values: Mapping[str, _Value], zero: _Value) -> tuple[_Value, ...]:
+        """Last arguments of ``set_rhythm``; ``zero`` where it has no such parameter."""
+        return tuple(values.get(name, zero) for name in ("period", "shift", "duty"))
 
 
 def set_condition(
@@ -455,10 +475,8 @@ def set_condition(
     ends_below: float,
     sets_in: float,
     fades: float,
-    period: float,
-    shift: float,
 ) -> None:
-    """Set the levels (mbar) and times (s) of the slot at ``first``; a period of 0 is none.
+    """Set the levels (mbar) and time constants (s) of the slot at ``first``.
 
     Plain arithmetic: it is translated into C for FMUs.
     """
@@ -466,8 +484,16 @@ def set_condition(
     theta[first + ENDS] = max(begins - ends_below, 1.0) * MBAR
     theta[first + SETS_IN] = sets_in
     theta[first + FADES] = fades
+
+
+def set_rhythm(theta: Theta, first: int, period: float, shift: float, duty: float) -> None:
+    """Set period and shift (s) and duty (%) of the slot at ``first``; a period of 0 is none.
+
+    Plain arithmetic: it is translated into C for FMUs.
+    """
     theta[first + PERIOD] = period if period > 0.0 else 1.0
     theta[first + SHIFT] = shift
+    theta[first + DUTY] = duty / 100.0
 
 
 def slot_at(number: int) -> int:

@@ -22,8 +22,9 @@ def _of_mechanism(slot: int) -> Mapping[str, tuple[str, str]]:
         f"MECHANISM_{slot}_ENDS": ("Pa", of + "vacuum below which it ends again"),
         f"MECHANISM_{slot}_SETS_IN": ("s", of + "time constant with which it sets in"),
         f"MECHANISM_{slot}_FADES": ("s", of + "time constant with which it fades"),
-        f"MECHANISM_{slot}_PERIOD": ("s", of + "of one that swings"),
-        f"MECHANISM_{slot}_SHIFT": ("s", of + "when its first swing begins"),
+        f"MECHANISM_{slot}_PERIOD": ("s", of + "of its rhythm"),
+        f"MECHANISM_{slot}_SHIFT": ("s", of + "when its first period begins"),
+        f"MECHANISM_{slot}_DUTY": ("1", of + "share of its period for which it is on"),
     }
 
 

@@ -49,8 +49,8 @@ static void component_outputs(struct Component *c, double drawn) {
     kernel_read_sensors(s, c->k, &expected, &signals);
     v[V_PORT_PRESSURE] = s[KERNEL_PORT];
     v[V_SENSOR_PRESSURE] = expected;
-    v[V_SIGNAL_PART_PRESENT] = (whole(signals) & KERNEL_PART_PRESENT) != 0;
-    v[V_SIGNAL_AIR_SAVING] = (whole(signals) & KERNEL_AIR_SAVING) != 0;
+    v[V_SIGNAL_PART_PRESENT] = (to_whole(signals) & KERNEL_PART_PRESENT) != 0;
+    v[V_SIGNAL_AIR_SAVING] = (to_whole(signals) & KERNEL_AIR_SAVING) != 0;
     v[V_SIGNAL_PHASE] = s[KERNEL_PHASE];
 #if VESSEL_OUTSIDE
     v[V_VESSEL_MASS_FLOW] = drawn;

@@ -1,0 +1,81 @@
+"""Periods, duties and phases from answers to short pulses."""
+
+import numpy as np
+import pytest
+
+from twin.diagnosis.rhythms import (
+    EARLIEST,
+    PHASES,
+    _Answers,
+    _box_gains,
+    _divided,
+    _folded,
+    _frequencies_of,
+    _pulses,
+    _spectra,
+    _swings,
+)
+from twin.monitor.bins import Floats
+
+WIDTH, COUNT = 0.05, 480  # s; pulses of 24 s
+TIMES = WIDTH * np.arange(COUNT)
+FREQUENCIES = _frequencies_of(24.0, 0.2, 120.0)
+
+
+def answers(period: float, duty: float, shift: float, seed: int = 1) -> _Answers:
+    """Answers that last for a third of a second, none while blown off, and noise of sigma 1."""
+    rng = np.random.default_rng(seed)
+    since = TIMES[:, None] - TIMES
+    heard = np.where(since >= 0.0, np.exp(-since / 0.3), 0.0) * 3.0
+    heard[(TIMES % 2.3) > 1.7] = 0.0
+    empty = _Answers(np.zeros(COUNT), heard, TIMES, WIDTH)
+    left = rng.normal(size=COUNT) - 0.7 * empty.of_rhythm(period, duty, shift)
+    return _Answers(left, heard, TIMES, WIDTH)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_what_is_on_and_off_is_found_whatever_its_period_duty_and_phase(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    period, duty = float(np.exp(rng.uniform(*np.log([0.6, 6.0])))), float(rng.uniform(0.2, 0.6))
+    shift = period * (EARLIEST + float(rng.random()))
+    heard = answers(period, duty, shift, seed)
+    found = _pulses(heard, _spectra(heard, FREQUENCIES))[0]
+    assert found[0] == pytest.approx(period, rel=0.01)
+    assert found[1] == pytest.approx(100.0 * duty, abs=4.0)
+    late = (found[2] - shift + period / 2.0) % period - period / 2.0
+    assert abs(late) < 0.1 * period
+    assert EARLIEST * found[0] <= found[2] < (1.0 + EARLIEST) * found[0]
+
+
+def test_what_swings_is_found_with_its_phase() -> None:
+    heard = answers(1.0, 0.5, 0.0)
+    wave = np.sin(2.0 * np.pi * (TIMES + WIDTH / 2.0 - 0.4) / 1.9)
+    left = np.random.default_rng(5).normal(size=COUNT) - 0.7 * heard.answers @ wave
+    swinging = _Answers(left, heard.answers, TIMES, WIDTH)
+    period, shift = _swings(_spectra(swinging, FREQUENCIES))[0]
+    assert period == pytest.approx(1.9, rel=0.03)
+    assert shift == pytest.approx(0.4, abs=0.2)
+
+
+def test_the_gain_of_a_box_is_that_of_least_squares() -> None:
+    heard = answers(1.7, 0.4, 0.3)
+    edges = np.arange(PHASES + 1) / PHASES
+    folded = _folded(heard, 1.0 / 1.7, edges)
+    assert folded.sum(axis=1) == pytest.approx(heard.answers.sum(axis=1))
+    gains = _box_gains(folded.T @ folded, -folded.T @ heard.residuals)
+    for first, number in ((0, 1), (5, 10), (20, 9)):  # the last one wraps
+        box = folded[:, np.arange(first, first + number) % PHASES].sum(axis=1)
+        expected = (box @ heard.residuals) ** 2 / (box @ box)
+        assert gains[first, number - 1] == pytest.approx(expected)
+
+
+def test_an_answer_belongs_to_the_last_pulse_before_it() -> None:
+    """Two runs, with a pulse each in 1 s, the second one half a second later."""
+    time = np.array([0.1, 0.6, 1.1, 1.6, 2.1])
+    heard: Floats = np.array([[1.0, 0.0], [2.0, 3.0], [4.0, 5.0], [6.0, 7.0], [8.0, 9.0]])
+    divided = _divided(heard, time, 1.0, np.arange(5))
+    assert divided.shape == (5, 6)
+    assert divided.sum(axis=1) == pytest.approx(heard.sum(axis=1))
+    assert divided[4, 4] == 8.0
+    assert divided[3, 3] == 7.0
+    assert not _divided(heard, time, 1.0, np.array([0]))[1:].any()

@@ -1,0 +1,263 @@
+"""Starting points of mechanisms in a rhythm of their own, from the residuals of a log.
+
+The pressure answers a short pulse in each part of a cycle otherwise, and blow-off interrupts its
+answer. So the model runs with short pulses, one in a cycle, until each part of the log has had one.
+Their answers add up to that to any rhythm: every period is tried by linear algebra. A rhythm that
+is on and off is found as a planet is that passes its star: by least squares of boxes over the
+residuals, folded by each period.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from twin.diagnosis.evidence import Evidence, Hypothesis
+from twin.diagnosis.fit import white
+from twin.diagnosis.residual_covariance import ResidualWhitener
+from twin.model.courses import Cause
+from twin.model.mechanism import MECHANISMS, PLACES, PULSED, RHYTHMIC, WHENS, Mechanism, Place
+from twin.monitor.bins import Floats, Ints
+
+# Least share of the squared deviation (mbar) that differs from cycle to cycle, for a search for
+# rhythms. Chosen: a swinging supply has 0.3 to 0.8; leaks, vapour and ice up to 0.06.
+DIFFERS = 0.1
+# The periodogram has frequencies half a line width (1 / duration) apart: a fit that begins farther
+# from a line does not reach it. MOST_FREQUENCIES bounds the computing time; on a long log the
+# fastest rhythms are then not searched.
+PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 400, 3
+SHORTEST = 0.05  # s, of a pulse
+MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of a mechanism
+LONGEST_PERIOD = {p.name: p.high for p in WHENS["pulsed"].parameters}["period"]  # s
+PHASES = 24  # parts of a period: a box begins and ends between two of them
+EARLIEST = 0.25  # periods: a first period that begins later leaves the fit room on both sides
+REFINED = {"xatol": 1e-4, "fatol": 1e-2, "maxiter": 300}  # sizes of a box in units of the log
+
+
+def rhythmic_starts(
+    evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis
+) -> list[tuple[Mechanism, tuple[float, ...]]]:
+    """Mechanisms with a rhythm, with values of their parameters other than sizes.
+
+    There is none if the deviation is the same in each cycle, or if a cycle with one pulse more is
+    longer than any period: then pulses cannot come once in a cycle.
+    """
+    ends = np.minimum(evidence.starts, len(evidence.clock) - 1)
+    longest = float(np.diff(evidence.clock[ends]).max())
+    if (
+        longest * (1.0 + 1.0 / MOST_PULSES) > LONGEST_PERIOD
+        or _differs(evidence, weights, causes) <= DIFFERS
+    ):
+        return []
+    mechanisms = [one for one in MECHANISMS.values() if one.when.code in RHYTHMIC]
+    duration = float(evidence.seconds[-1] - evidence.seconds[0])
+    starts = list[tuple[Mechanism, tuple[float, ...]]]()
+    for place in PLACES.values():
+        of_place = [one for one in mechanisms if one.place is place]
+        if of_place:
+            answers = _Answers.of(evidence, weights, causes, place, longest)
+            period = of_place[0].when.parameters[0]
+            spectra = _spectra(answers, _frequencies_of(duration, period.low, period.high))
+            for one in of_place:
+                pulsed = one.when.code == PULSED
+                shapes = _pulses(answers, spectra) if pulsed else _swings(spectra)
+                starts += [(one, _within(one, shape)) for shape in shapes]
+    return starts
+
+
+def _differs(evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis) -> float:
+    """Share of the squared deviation (mbar) that is not the same in each cycle, 0 to 1."""
+    off, count = evidence.off([causes])[weights.bins, 0], evidence.bins.count[weights.bins]
+    _, place = np.unique(evidence.bins.place[weights.bins], return_inverse=True)
+    mean = np.bincount(place, off * count) / np.bincount(place, count)
+    return float(np.sum(count * (off - mean[place]) ** 2) / max(np.sum(count * off**2), 1e-9))
+
+
+def _frequencies_of(duration: float, shortest: float, longest: float) -> Floats:
+    """Frequencies (Hz) that a log of some duration (s) tells apart, between two periods (s)."""
+    slowest, step = 1.0 / min(duration, longest), 1.0 / (PER_LINE * duration)
+    fastest = min(1.0 / shortest, slowest + step * MOST_FREQUENCIES)
+    return np.arange(slowest, fastest, step)
+
+
+# --- answers to short pulses ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """Answers of the whitened residuals to one typical size of a place in each short pulse."""
+
+    residuals: Floats
+    answers: Floats  # (residuals, pulses)
+    begins: Floats  # s, of each pulse, by the clock of the kernel
+    width: float  # s, of a pulse
+
+    @classmethod
+    def of(
+        cls,
+        evidence: Evidence,
+        weights: ResidualWhitener,
+        causes: Hypothesis,
+        place: Place,
+        longest: float,
+    ) -> "_Answers":
+        """Run the model with one pulse in a cycle, as often as pulses fit into the longest one.
+
+        ``longest`` (s) is the duration of that cycle.
+        """
+        width = max(SHORTEST, longest / MOST_PULSES)
+        count = int(np.ceil(longest / width))
+        period = count * width
+        (size,) = place.parameters
+        duty = 100.0 * width / period
+        pulse = {size.name: size.typical, "period": period, "duty": duty}
+        name = Mechanism(place, WHENS["pulsed"]).name
+        tried = [(*causes, Cause(name, {**pulse, "shift": i * width})) for i in range(count)]
+        off = evidence.off([causes, *tried])
+        parts = _divided(
+            off[:, 1:] - off[:, :1], evidence.bins.mean(evidence.clock), period, weights.bins
+        )
+        begins = width * np.arange(parts.shape[1])
+        answers = weights.white(parts)
+        seen = answers.any(axis=0)
+        residuals = white(evidence, weights, [causes])[:, 0]
+        return cls(residuals, answers[:, seen], begins[seen], width)
+
+    def of_rhythm(self, period: float, duty: float, shift: float) -> Floats:
+        """Answer to a rhythm that is on for a share ``duty`` of its period, from ``shift`` on."""
+        ends = np.array([self.begins, self.begins + self.width]) - shift
+        begun, over = _on(ends / period, duty)
+        return self.answers @ ((over - begun) * period / self.width)
+
+
+def _divided(answers: Floats, time: Floats, period: float, bins: Ints) -> Floats:
+    """Answers to repeated pulses by pulse, (bins of the deviation, pulses).
+
+    A column of ``answers`` has pulses one ``period`` (s) apart; each is over when the next begins.
+    """
+    count = answers.shape[1]
+    width = period / count
+    turns = int((time.max() + width) / period) + 1
+    divided = np.zeros((len(answers), count * turns))
+    rows = np.arange(len(answers))
+    for number in range(count):
+        turn = np.floor((time - (number - 1) * width) / period).astype(np.int64)
+        heard = (turn >= 0) & np.isin(rows, bins)
+        divided[rows[heard], number + count * turn[heard]] = answers[heard, number]
+    return divided
+
+
+def _on(periods: Floats, duty: float) -> Floats:
+    """Sum (in periods) of the time until ``periods`` for which a rhythm is on."""
+    whole = np.floor(periods)
+    on: Floats = whole * duty + np.minimum(periods - whole, duty)
+    return on
+
+
+# --- periods --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Spectra:
+    """What is gained in chi-square at each frequency, by a wave and by the best box."""
+
+    frequencies: Floats
+    of_wave: Floats
+    wave_shift: Floats  # periods
+    of_box: Floats
+    box: Ints  # (frequencies, first and number of phases)
+
+
+def _spectra(answers: _Answers, frequencies: Floats) -> _Spectra:
+    edges = np.arange(PHASES + 1) / PHASES
+    angles = 2.0 * np.pi * (edges[:-1] + 0.5 / PHASES)
+    waves = np.column_stack([np.sin(angles), -np.cos(angles)])
+    of_wave, shift, of_box = (np.empty(len(frequencies)) for _ in range(3))
+    box = np.empty((len(frequencies), 2), np.int64)
+    for i, frequency in enumerate(frequencies):
+        folded = _folded(answers, float(frequency), edges)
+        information, gradient = folded.T @ folded, -folded.T @ answers.residuals
+        moved = waves.T @ gradient
+        sine, cosine = np.linalg.lstsq(waves.T @ information @ waves, moved, rcond=None)[0]
+        of_wave[i] = moved @ (sine, cosine)
+        shift[i] = np.arctan2(cosine, sine) % (2.0 * np.pi) / (2.0 * np.pi)
+        gains = _box_gains(information, gradient)
+        first, number = np.unravel_index(int(np.argmax(gains)), gains.shape)
+        of_box[i], box[i] = gains[first, number], (first, number + 1)
+    return _Spectra(frequencies, of_wave, shift, of_box, box)
+
+
+def _folded(answers: _Answers, frequency: float, edges: Floats) -> Floats:
+    """Answers to each phase of a period, (residuals, phases)."""
+    ends = np.array([answers.begins, answers.begins + answers.width]) * frequency
+    whole = np.floor(ends)[..., None]
+    before = np.clip(ends[..., None] - whole - edges[:-1], 0.0, 1.0 / PHASES) + whole / PHASES
+    shares = (before[1] - before[0]) / (answers.width * frequency)
+    folded: Floats = answers.answers @ shares
+    return folded
+
+
+def _box_gains(information: Floats, gradient: Floats) -> Floats:
+    """Gain of each box in chi-square, (first phase, number of phases - 1); boxes may wrap."""
+    sums = np.zeros((2 * PHASES + 1, 2 * PHASES + 1))
+    sums[1:, 1:] = np.tile(information, (2, 2)).cumsum(0).cumsum(1)
+    pulls = np.concatenate([[0.0], np.cumsum(np.tile(gradient, 2))])
+    first = np.arange(PHASES)[:, None]
+    last = first + np.arange(1, PHASES)
+    squares = sums[last, last] - sums[first, last] - sums[last, first] + sums[first, first]
+    gains: Floats = (pulls[last] - pulls[first]) ** 2 / np.maximum(squares, np.finfo(float).tiny)
+    return gains
+
+
+def _peaks(gains: Floats) -> Ints:
+    """Where the highest peaks are, the highest first."""
+    around = np.pad(gains, 1, constant_values=-np.inf)
+    peaks = np.flatnonzero((gains >= around[:-2]) & (gains >= around[2:]))
+    return peaks[np.argsort(-gains[peaks])[:PEAKS]]
+
+
+def _swings(spectra: _Spectra) -> list[tuple[float, ...]]:
+    """Period and shift (s) at the highest peaks of a wave."""
+    return [
+        (1.0 / float(spectra.frequencies[i]), float(spectra.wave_shift[i] / spectra.frequencies[i]))
+        for i in _peaks(spectra.of_wave)
+    ]
+
+
+def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
+    """Period (s), duty (%) and shift (s) at the highest peaks of a box, refined one by one.
+
+    A box is shifted in the middle of the log, so that another period does not move it.
+    """
+    middle = float(np.mean(answers.begins))
+
+    def shape(x: Floats) -> tuple[float, float, float]:
+        period = 1.0 / float(x[0])
+        return period, float(np.clip(x[1], 0.02, 0.98)), middle + float(x[2]) * period
+
+    def misfit(x: Floats) -> float:
+        moved = answers.of_rhythm(*shape(x))
+        pull = float(moved @ answers.residuals)
+        return -(pull**2) / max(float(moved @ moved), np.finfo(float).tiny)
+
+    found = list[tuple[float, ...]]()
+    for i in _peaks(spectra.of_box):
+        frequency, (first, number) = float(spectra.frequencies[i]), spectra.box[i]
+        start = np.array([frequency, number / PHASES, first / PHASES - middle * frequency % 1.0])
+        step = (spectra.frequencies[1] - spectra.frequencies[0]) / 2.0
+        simplex = start + np.vstack([np.zeros(3), np.diag([step, 1.0 / PHASES, 1.0 / PHASES])])
+        best = minimize(
+            misfit, start, method="Nelder-Mead", options={**REFINED, "initial_simplex": simplex}
+        )
+        period, duty, shift = shape(best.x)
+        earliest = EARLIEST * period
+        found.append((period, 100.0 * duty, earliest + (shift - earliest) % period))
+    return found
+
+
+def _within(mechanism: Mechanism, shape: tuple[float, ...]) -> tuple[float, ...]:
+    """A shape within the bounds of the parameters."""
+    table = mechanism.when.parameters
+    return tuple(
+        float(np.clip(value, p.low, p.high)) for value, p in zip(shape, table, strict=True)
+    )
