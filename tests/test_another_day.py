@@ -121,7 +121,7 @@ def test_weather_seldom_changes_while_a_log_is_recorded() -> None:
 def test_weather_moves_h1_where_the_ejector_s_own_sensor_counts_from_zero(rig: str) -> None:
     """What the rig shows then, its levels in vacuum moved as the weather did, is one cause."""
     moved = ("threshold_drift.h1_shift=-25", "threshold_drift.h2_shift=-25")
-    samples, _ = rigs.recorded(rig, 40.0, ("ambient_pressure=-25", *moved), seed=7)
+    samples, _ = rigs.recorded(rig, 24.0, ("ambient_pressure=-25", *moved), seed=7)
     diagnosis = diagnose(rigs.config(rig), [samples], "log", lambda _: None)
     (cause,) = diagnosis.json["causes"]
     assert cause["effect"] == "ambient_pressure"
