@@ -4,27 +4,37 @@ Programs run here as after ``pip install`` of the wheel alone: each import of an
 in the processes that they start, too.
 """
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import time
 import tomllib
 import zipfile
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import hatchling.build
+import numpy as np
 import pytest
 import rigs
 from packaging.utils import canonicalize_name
 from plc_process import PlcProcess
+from test_started_at_once import PATIENCE_S, S, expected_again, logged, missing, told
 
 from tools.audit import needs_of, reached
+from twin.cli.compiling import COMPILING
 from twin.cli.init import STARTERS
-from twin.errors import ConfigError
+from twin.errors import ConfigError, SourceError
+from twin.events import Kind
 from twin.extras import install_hint
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
+from twin.signals import Samples
 
 GRIPPER, OPC_UA = rigs.path_of("gripper"), rigs.path_of("test_rig_opcua")
 ONLY = """
@@ -37,7 +47,7 @@ class Missing:
 
 sys.meta_path.insert(0, Missing())
 """
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
+FIRST_ROW_S = 15.0  # from the start of the process, with nothing compiled
 
 
 def modules_of_no_base() -> set[str]:
@@ -51,33 +61,54 @@ def modules_of_no_base() -> set[str]:
     }
 
 
-def base_in(folder: Path, root: Path) -> Run:
+@dataclass(frozen=True)
+class Base:
     """Runs the program of ``root`` in a folder, as the base installation does."""
-    missing = modules_of_no_base() - {"twin", "drivers", "coverage"}
-    (folder / "sitecustomize.py").write_text(f"NOT_THERE = {missing!r}\n{ONLY}")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(root)])}
 
-    def run(*arguments: str | Path, code: str = "") -> "subprocess.CompletedProcess[str]":
+    folder: Path
+    root: Path
+
+    def __post_init__(self) -> None:
+        missing = modules_of_no_base() - {"twin", "drivers", "coverage"}
+        (self.folder / "sitecustomize.py").write_text(f"NOT_THERE = {missing!r}\n{ONLY}")
+
+    def __call__(
+        self, *arguments: str | Path, code: str = ""
+    ) -> "subprocess.CompletedProcess[str]":
+        """Run a command, or some code, to its end."""
+        with self.started(*arguments, code=code) as process:
+            out, said = process.communicate()
+        return subprocess.CompletedProcess(process.args, process.returncode, out, said)
+
+    @contextmanager
+    def started(self, *arguments: str | Path, code: str = "") -> Iterator["subprocess.Popen[str]"]:
+        """Start it; it is killed at the end if it still runs."""
         what = ["-c", code] if code else ["-m", "twin.cli", *map(str, arguments)]
-        return subprocess.run(
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join([str(self.folder), str(self.root)])
+        }
+        pipe = subprocess.PIPE
+        with subprocess.Popen(
             [sys.executable, *what],
             env=environment,
-            cwd=folder,
-            capture_output=True,
+            cwd=self.folder,
+            stdout=pipe,
+            stderr=pipe,
             text=True,
-            check=False,
-        )
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return base_in(tmp_path_factory.mktemp("base"), rigs.ROOT)
+        ) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
+    return Base(tmp_path_factory.mktemp("base"), rigs.ROOT)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Base:
     """Runs what is in the wheel, away from the checkout."""
     folder, root = tmp_path_factory.mktemp("away"), tmp_path_factory.mktemp("wheel")
     with pytest.MonkeyPatch.context() as patch:
@@ -85,7 +116,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Run:
         name = hatchling.build.build_wheel(str(root))
     with zipfile.ZipFile(root / name) as archive:
         archive.extractall(root)
-    return base_in(folder, root)
+    return Base(folder, root)
 
 
 def done(process: "subprocess.CompletedProcess[str]") -> str:
@@ -98,19 +129,30 @@ def done(process: "subprocess.CompletedProcess[str]") -> str:
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of healthy cycles, enough to calibrate."""
     path = tmp_path_factory.mktemp("log") / "healthy.mcap"
-    samples, _ = rigs.recorded("gripper", 20.0)
+    return write_log(path, rigs.recorded("gripper", 20.0)[0])
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with fewer rows, which a commissioning fits sooner."""
+    samples = rigs.recorded("gripper", 16.0)[0][::4].copy()
+    samples["sequence"], samples["pressure_2"] = np.arange(len(samples)), 0.0
+    return write_log(tmp_path_factory.mktemp("coarse") / "coarse.mcap", samples)
+
+
+def write_log(path: Path, samples: Samples) -> Path:
     with Recorder(path, rigs.config("gripper").log_header()) as recorder:
         recorder.write(*rigs.expectation(rigs.twin("gripper"), [samples]), [])
     return path
 
 
-def test_the_base_has_no_package_of_an_extra(base: Run) -> None:
+def test_the_base_has_no_package_of_an_extra(base: Base) -> None:
     assert "No module named 'matplotlib'" in base(code="import matplotlib").stderr
     assert done(base(code="import numba, pymodbus, mcap")) == ""
 
 
 @pytest.mark.slow
-def test_a_first_configuration(base: Run, tmp_path: Path) -> None:
+def test_a_first_configuration(base: Base, tmp_path: Path) -> None:
     for name, address in (("cell", "10.0.0.5:502"), ("node", "opc.tcp://plc:4840")):
         path = tmp_path / f"{name}.toml"
         done(base("init", path, "--address", address))
@@ -119,7 +161,7 @@ def test_a_first_configuration(base: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_beside_a_plc(base: Run, plc: PlcProcess, tmp_path: Path) -> None:
+def test_a_run_beside_a_plc(base: Base, plc: PlcProcess, tmp_path: Path) -> None:
     address = ("--address", f"127.0.0.1:{plc.port}")
     assert "scan" in done(base("probe", GRIPPER, *address))
     done(base("run", GRIPPER, *address, "--log", tmp_path / "a.mcap", "--duration", "2"))
@@ -128,19 +170,59 @@ def test_a_run_beside_a_plc(base: Run, plc: PlcProcess, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STARTERS)
-def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: Run) -> None:
+def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: Base) -> None:
     assert str(rigs.ROOT) not in done(wheel(code="import twin; print(twin.__file__)"))
     assert f"twin plc {name}.toml" in done(wheel("init", f"{name}.toml", "--starter", name))
     assert "no mistake" in done(wheel("config", "check", f"{name}.toml"))
 
 
+def until_live(log: Path) -> None:
+    """Wait until what waited has been worked off, and rows are logged as they come."""
+    until_received(log, 1)
+    until_received(log, time.time_ns())
+
+
+def until_received(log: Path, since_ns: int) -> None:
+    """Wait for a row that was received at that time or later."""
+    deadline = time.monotonic() + PATIENCE_S
+    while last_received_ns(log) < since_ns:
+        assert time.monotonic() < deadline, "nothing is logged"
+        time.sleep(0.2)
+
+
+def last_received_ns(log: Path) -> int:
+    """When the last row was received; 0 without any."""
+    try:
+        return max((int(rows["host_ns"][-1]) for rows, _ in open_log(log).blocks()), default=0)
+    except SourceError:  # not yet there, or its head not yet written
+        return 0
+
+
 @pytest.mark.slow
-def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
+@pytest.mark.timeout(600)
+def test_on_a_new_machine_the_first_row_of_a_wheel_is_there_at_once(
+    wheel: Base, plc: PlcProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that came while the model was compiled is logged with it."""
+    log = wheel.folder / "a.mcap"
     done(wheel("init", "rig.toml", "--starter", "gripper"))
-    assert "listening" in done(wheel("plc", "rig.toml", "--port", "0", "--duration", "0.1"))
-    options = ("--address", f"127.0.0.1:{plc.port}", "--duration", "1", "--log", "a.mcap")
-    done(wheel("run", "rig.toml", *options))
-    assert "state: complete" in done(wheel("log", "check", "a.mcap"))
+    with monkeypatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(wheel.folder / "cache"))
+        assert "listening" in done(wheel("plc", "rig.toml", "--port", "0", "--duration", "0.1"))
+        address = ("--address", f"127.0.0.1:{plc.port}")
+        begun_ns = time.time_ns()
+        with wheel.started("run", "rig.toml", *address, "--log", log) as process:
+            until_live(log)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert said == f"twin: {COMPILING}\n"
+    samples, ticks = logged(log)
+    assert samples["host_ns"][0] - begun_ns < FIRST_ROW_S * S
+    assert missing(samples) == 0
+    assert Kind.NO_MODEL not in told(log)
+    assert ticks.tobytes() == expected_again(log, monkeypatch)
+    assert "state: complete" in done(wheel("log", "check", log))
 
 
 @pytest.mark.slow
@@ -150,7 +232,7 @@ def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
         ("log check L", "rows"),
         ("replay L", "cycle"),
         ("calibrate L --config C --id new --assets assets.sqlite", "new"),
-        ("commission L --config C --id other --assets assets.sqlite --json a.json", "other"),
+        ("commission R --config C --id other --assets assets.sqlite --json a.json", "other"),
         ("diagnose L --json b.json", ""),
         ("figures show L", "evacuation"),
         ("figures costs L", ""),
@@ -165,9 +247,11 @@ def test_the_first_run_of_a_wheel(wheel: Run, plc: PlcProcess) -> None:
         ("--version", "twin"),
     ],
 )
-def test_the_main_way_needs_no_extra(command: str, says: str, base: Run, log: Path) -> None:
-    arguments = [{"L": str(log), "C": str(GRIPPER)}.get(word, word) for word in command.split()]
-    assert says in done(base(*arguments))
+def test_the_main_way_needs_no_extra(
+    command: str, says: str, base: Base, log: Path, coarse: Path
+) -> None:
+    paths = {"L": log, "R": coarse, "C": GRIPPER}
+    assert says in done(base(*(paths.get(word, word) for word in command.split())))
 
 
 HINTS = {
@@ -203,27 +287,55 @@ HINTS = {
 }  # fmt: skip
 
 
+# Runs each command of a list as the program does; prints exit codes and what was complained of.
+EACH = """
+import io, json, sys
+from contextlib import redirect_stderr, redirect_stdout
+from twin.cli.main import main
+
+answers = []
+for arguments in COMMANDS:
+    sys.argv, said, code = ["twin", *arguments], io.StringIO(), 0
+    with redirect_stderr(said), redirect_stdout(io.StringIO()):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    answers.append([code, said.getvalue()])
+print(json.dumps(answers))
+"""
+
+
+@pytest.fixture(scope="module")
+def refused(base: Base, log: Path) -> dict[str, tuple[int, str]]:
+    """Exit code and complaint of each command of ``HINTS``, all run in one process."""
+    paths = {"L": str(log), "C": str(GRIPPER), "U": str(OPC_UA)}
+    hints = [hint for some in HINTS.values() for hint in some]
+    commands = [[paths.get(word, word) for word in hint.split()] for hint in hints]
+    answers = json.loads(done(base(code=f"COMMANDS = {commands!r}\n{EACH}")))
+    return {hint: (code, said) for hint, (code, said) in zip(hints, answers, strict=True)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("extra", "command"), [(extra, hint) for extra, some in HINTS.items() for hint in some]
 )
 def test_without_its_extra_a_command_says_what_to_install(
-    extra: str, command: str, base: Run, log: Path, tmp_path: Path
+    extra: str, command: str, refused: dict[str, tuple[int, str]]
 ) -> None:
-    paths = {"L": log, "C": GRIPPER, "U": OPC_UA}
-    refused = base(*(paths.get(word, word) for word in command.split()))
-    assert refused.returncode == ConfigError.exit_code, refused.stderr
-    first, second = refused.stderr.splitlines()
+    code, said = refused[command]
+    assert code == ConfigError.exit_code, said
+    first, second = said.splitlines()
     assert first.startswith("twin: ")
     assert f" needs the extra [{extra}]: " in first
     assert second.strip() == install_hint(extra)
 
 
-def test_results_over_opcua_need_the_extra(base: Run, tmp_path: Path) -> None:
+def test_results_over_opcua_need_the_extra(base: Base, tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(GRIPPER.read_text() + "\n[results]\nopcua = true\n")
     assert "[results] over OPC UA needs the extra [opcua]" in base("run", path, "--once").stderr
 
 
-def test_a_notebook_needs_the_extra(base: Run) -> None:
+def test_a_notebook_needs_the_extra(base: Base) -> None:
     assert "twin.open needs the extra [notebook]" in base(code="import twin; twin.open").stderr

@@ -1,8 +1,6 @@
 """A run on a new machine: rows are acquired while the model is compiled, and all reach the log."""
 
-import signal
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +14,11 @@ from test_run_many import two_on_one
 from twin import acquisition
 from twin.cli import compiling
 from twin.cli.compiling import COMPILING, Models
-from twin.errors import SourceError
 from twin.events import Kind
 from twin.log.reader import open_log
 from twin.signals import Command, Phase, Samples, Ticks
 
 GRIPPER = rigs.path_of("gripper")
-FIRST_ROW_S = 15.0  # from the start of the process, with nothing compiled
 PATIENCE_S = 280.0  # with a compiler on a busy machine
 S = 1_000_000_000  # ns
 WITHOUT_MODEL = "rows are logged without expected pressure"
@@ -247,50 +243,3 @@ def test_a_start_imports_nothing_that_it_does_not_need(
     imported = {line.rpartition("|")[2].strip() for line in said.splitlines()}
     assert {"numba", "twin.log.recorder"} <= imported
     assert imported & {*LATER} == set()
-
-
-# The compiler itself.
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_on_a_new_machine_the_first_row_is_there_at_once(
-    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = tmp_path / "a.mcap"
-    with monkeypatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        begun_ns = time.time_ns()
-        with started(*beside(plc, log, 2 * PATIENCE_S)) as process:
-            until_live(log)
-            process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 130
-    assert said == f"twin: {COMPILING}\n"
-    samples, ticks = logged(log)
-    assert samples["host_ns"][0] - begun_ns < FIRST_ROW_S * S
-    assert missing(samples) == 0
-    assert Kind.NO_MODEL not in told(log)
-    assert ticks.tobytes() == expected_again(log, monkeypatch)
-
-
-def until_live(log: Path) -> None:
-    """Wait until what waited has been worked off, and rows are logged as they come."""
-    until_received(log, 1)
-    until_received(log, time.time_ns())
-
-
-def until_received(log: Path, since_ns: int) -> None:
-    """Wait for a row that was received at that time or later."""
-    deadline = time.monotonic() + PATIENCE_S
-    while last_received_ns(log) < since_ns:
-        assert time.monotonic() < deadline, "nothing is logged"
-        time.sleep(0.2)
-
-
-def last_received_ns(log: Path) -> int:
-    """When the last row was received; 0 without any."""
-    try:
-        return max((int(rows["host_ns"][-1]) for rows, _ in open_log(log).blocks()), default=0)
-    except SourceError:  # not yet there, or its head not yet written
-        return 0
