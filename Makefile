@@ -2,11 +2,12 @@
 # Without a network: PIP_NO_INDEX=1 PIP_FIND_LINKS=/folder/of/wheels make ...
 PYTHON ?= python3
 BIN := .venv/bin
-# Files among processes, each with one thread for matrices: more wait for each other.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# Files among processes (tests/conftest.py says how many), each with one thread for matrices: more
+# threads wait for each other.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help demo test short peers check quick hooks format docs bench battery soak fuzz audit coverage clean
+.PHONY: help demo test short peers check quick style imports types physics hooks format docs bench battery soak fuzz audit coverage clean
 
 help:  ## say what there is (this)
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -27,12 +28,20 @@ peers:  ## a broker, a browser and PLCs of other make for the tests
 check: quick  ## what CI runs: format, lint, types, import contracts, tests
 	$(PYTEST)
 
-quick: .venv/dev  ## the same without the tests
+quick: style imports types physics  ## the same without the tests
+
+style: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
-	$(BIN)/basedpyright --pythonpath $(BIN)/python
+
+imports: .venv/dev
 	$(BIN)/lint-imports
+
+types: .venv/dev
+	$(BIN)/mypy
+
+physics: .venv/dev
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 hooks:  ## let git run make quick before each commit
 	git config core.hooksPath tools/hooks

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from once import once
 
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
@@ -43,7 +44,7 @@ def log_of(
     return samples
 
 
-@cache
+@once
 def calibrated(name: str) -> Calibration:
     return calibrate(typed(name), [log_of(name)], quiet)
 

@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import once
 import psutil
 import pytest
 import rigs
@@ -28,6 +29,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from plc_process import PlcProcess, start_plc
 from postgres import make_schema, postgres_server
 
+from tools import battery_first
 from twin.cli.figures import figures_app
 from twin.cli.setup import pair_of
 
@@ -38,6 +40,30 @@ _LEFT_OUT = pytest.StashKey[Counter[str]]()
 
 settings.register_profile("untimed", deadline=None)  # what is slow here may be quick elsewhere
 settings.load_profile("untimed")
+
+
+# --- how files are divided ------------------------------------------------------------------------
+
+# The files that take longest, as measured in CI. They go first, so that no process is alone with
+# one at the end, and those that calculate beside those that wait for a PLC or a browser.
+FIRST = (
+    *("battery", "journeys", "diagnosis", "fault_run", "base_installation", "peers"),
+    *("first_change", "page_browser", "mechanisms", "hil", "site", "another_day", "run_many"),
+    *("unmodelled", "cli", "commission", "written_pages", "signal_checks", "page_past", "results"),
+    *("healthy", "started_at_once", "measured_supply", "calibration", "page_all", "report", "aas"),
+)
+MOST_PROCESSES = 4
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: a test in four waits for something that is not calculated."""
+    return min((psutil.cpu_count() or 1) + 1, MOST_PROCESSES)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {f"test_{name}": place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 # --- programs of the system ---------------------------------------------------------------------
@@ -229,9 +255,20 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_once() -> None:
+def calculated_once(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> None:
+    """Processes of one run share what was calculated once."""
+    if hasattr(request.config, "workerinput"):
+        once.share(tmp_path_factory.getbasetemp().parent / "shared")
+    battery_first.unit = once.once(battery_first.unit)  # two calibrations
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once(calculated_once: None) -> None:
     """Compile before a child process has to: tests wait for what it does, not for a compiler."""
-    pair_of(rigs.config("gripper"))  # all that a live loop needs
+    with once.alone("compiled"):
+        pair_of(rigs.config("gripper"))  # all that a live loop needs
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """The documentation's pages: built without a warning, and read from a disk without a network."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -34,13 +35,19 @@ class Reader:
         self.page.goto((self.folder / name).as_uri())
 
 
+def make_docs() -> list[str]:
+    """The command of ``make docs``, which CI does not run beside these tests."""
+    makefile = (rigs.ROOT / "Makefile").read_text(encoding="utf-8")
+    (line,) = re.findall(r"\$\(BIN\)/python (-m sphinx .* docs site)\n", makefile)
+    return [sys.executable, *line.split()]
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    options = ["--fail-on-warning", "--keep-going", "--quiet", "--doctree-dir"]
-    command = [sys.executable, "-m", "sphinx", *options, folder / "trees"]
-    command += [rigs.ROOT / "docs", folder / "site"]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    command: list[str | Path] = [folder / word if word == "site" else word for word in make_docs()]
+    command += ["--doctree-dir", folder / "trees"]
+    built = subprocess.run(command, cwd=rigs.ROOT, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     return folder / "site"
 
