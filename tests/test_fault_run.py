@@ -114,16 +114,18 @@ def test_a_part_without_an_end_is_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["the disk is full", "the folder of the log is deleted"])
-def test_disk_faults_cost_no_row(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disk_faults_cost_no_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("the disk is full", "the folder of the log is deleted")
+    monkeypatch.setattr(fault_run, "SETTLED_S", 5.0)
     monkeypatch.setattr(fault_run, "GROWTH_MB", 60.0)
-    monkeypatch.setattr(fault_run, "DISTURBANCES", {name: fault_run.DISTURBANCES[name]})
-    verdict, _ = fault_run.run("modbus", 20.0, 1, 1, tmp_path)
+    monkeypatch.setattr(
+        fault_run, "DISTURBANCES", {name: fault_run.DISTURBANCES[name] for name in names}
+    )
+    verdict, done = fault_run.run("modbus", 20.0, len(names), 1, tmp_path)
     assert verdict.problems == []
-    assert verdict.counts["log_down"] == 1
-    assert verdict.counts["parts"] == 2
+    assert {text.partition(" (")[0] for text in done} == set(names)
+    assert verdict.counts["log_down"] == len(names)
+    assert verdict.counts["parts"] == len(names) + 1
 
 
 def test_rows_of_no_plc_are_seen(tmp_path: Path) -> None:
