@@ -21,7 +21,7 @@ from twin.config import Config
 from twin.diagnosis import answer as answer_module
 from twin.diagnosis import search as search_module
 from twin.diagnosis.answer import EXPLAINED, Diagnosis, _left_in_all, diagnose
-from twin.diagnosis.evidence import HEALTHY, Hypothesis, _unsettled, collect, thinned
+from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, _unsettled, collect, thinned
 from twin.diagnosis.fit import Fitted
 from twin.diagnosis.healthy import apart
 from twin.diagnosis.held_out import gain, judge
@@ -31,6 +31,7 @@ from twin.diagnosis.onset import tried_in_or_out
 from twin.diagnosis.residual_covariance import CLOSING_MS, covariance, levels, moved, scatter
 from twin.diagnosis.search import _about, _confirmed, held_out_gain
 from twin.diagnosis.unlisted import Unlisted, look
+from twin.diagnosis.unmodelled import Unmodelled
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
 from twin.model.courses import Cause, Course
@@ -769,6 +770,96 @@ def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
     kept = _confirmed(evidence, fitted, _about(evidence, fitted, both))
     assert kept is not None
     assert kept.effects == ("leakage",)
+
+
+@cache
+def with_leak_and_heat() -> tuple[Evidence, list[int]]:
+    """A leak whose gas is warmed by the wall more than usual, and the fitted cycles."""
+    evidence = collect(CONFIG, record(27.0, "leakage=1.7", "heat_exchange=40", seed=21))
+    return evidence, evidence.judged[::2]
+
+
+def test_a_cause_that_hides_in_the_size_of_another_is_found_far_from_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Beside a leak that fits best alone no small change of another cause need gain anything."""
+    evidence, fitted = with_leak_and_heat()
+    leak = _about(evidence, fitted, (Cause("leakage", {"sonic_flow": 0.8}),))
+    monkeypatch.setattr(search_module, "linear_gains", lambda *_, **__: [])
+    monkeypatch.setattr(search_module, "_linear_pairs", lambda *_: [])
+    alone = signatures(evidence, evidence.judged)
+    found = search_module._best_addition(evidence, leak, [], alone)
+    assert found is not None
+    assert found.effects == ("leakage", "heat_exchange")
+    assert found.x[0] > 1.5 * leak.found.x[0]  # the leak's own size moves along
+    quiet = replace(leak, found=replace(leak.found, chi2=float(leak.found.count)))
+    monkeypatch.setattr(search_module, "fit", lambda *_, **__: [])
+    monkeypatch.setattr(search_module, "_far_additions", lambda *_: pytest.fail("not asked for"))
+    assert search_module._best_addition(evidence, quiet, [], alone) is None
+
+
+def test_a_cause_that_hides_in_the_width_of_another_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By weights about both the leak alone may look good enough; by its own it leaves much more."""
+    evidence, fitted = with_leak_and_heat()
+    causes = Cause("leakage", {"sonic_flow": 1.7}), Cause("heat_exchange", {"film_coefficient": 40})
+    both = _about(evidence, fitted, causes)
+    monkeypatch.setattr(search_module, "_worth", lambda *_: False)
+    assert search_module._pruned(evidence, fitted, both).effects == both.found.effects
+
+    own = search_module._by_own_weights
+
+    def as_good(*given: Any) -> tuple[Any, Fitted]:
+        return both, replace(own(*given)[1], score=both.found.score)
+
+    def noise(*given: Any) -> tuple[Any, Fitted]:
+        return both, replace(own(*given)[1], chi2=float(both.found.count))
+
+    for others in (as_good, noise):  # one of the two is no reason to keep a cause
+        monkeypatch.setattr(search_module, "_by_own_weights", others)
+        assert len(search_module._pruned(evidence, fitted, both).hypothesis) == 1
+
+
+@pytest.mark.parametrize("exhaust_follows", [0.0, 1.0])
+def test_a_cause_gets_the_law_that_is_best_beside_the_others(exhaust_follows: float) -> None:
+    evidence = collect(CONFIG, record(27.0, "suction_loss=30", seed=21))
+    fitted = evidence.judged[::2]
+    loss = (Cause("suction_loss", {"loss": 30.0, "exhaust_follows": exhaust_follows}),)
+    found = search_module._by_best_law(evidence, fitted, _about(evidence, fitted, loss)).found
+    assert found.hypothesis[0].law() == {"exhaust_follows": 0.0}
+    assert found.leftover < 0.9
+
+
+def test_weather_that_nobody_measured_is_no_answer_where_more_is_left() -> None:
+    evidence = with_leak().evidence
+    weather = Cause("ambient_pressure", {"shift": -12.0})
+    drop = replace(weather, course=Course.STEP, onset_s=12.0)
+    leak = Cause("leakage", {"sonic_flow": 1.0})
+
+    def is_doubtful(*causes: Cause, probability: float = 0.6) -> bool:
+        probabilities = [probability] * len(causes)
+        return answer_module._is_doubtful(evidence, causes, probabilities)
+
+    assert is_doubtful(weather)
+    assert not is_doubtful(drop)  # that is seldom
+    assert not is_doubtful(leak, weather)
+    assert not is_doubtful(leak)
+    assert is_doubtful(leak, probability=0.1)
+    measured = replace(evidence, told=frozenset({"ambient"}))
+    assert not answer_module._is_doubtful(measured, (weather,), [0.6])
+
+
+def test_only_a_small_waveform_corrects_another() -> None:
+    evidence = collect(GRIPPER, [recorded(GRIPPER_PLC, 4, 32)])
+    causes = (
+        Cause("leakage", {"sonic_flow": 3.0}),
+        Cause("suction_loss", {"loss": 0.1}),
+        Cause("threshold_drift", {"h1_shift": 20.0}),
+    )
+    weights = covariance(evidence, causes).of(evidence.judged)
+    beside = Unmodelled(evidence, weights, causes)
+    assert [beside.corrects_waveform(number) for number in range(3)] == [False, True, False]
 
 
 @pytest.mark.slow

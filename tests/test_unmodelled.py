@@ -10,7 +10,7 @@ from tools import battery_first
 from twin.diagnosis.answer import diagnose
 from twin.inference import unmodelled
 from twin.inference.priors import tempered
-from twin.inference.unmodelled import LEAST_SURE, SHARES, Odds
+from twin.inference.unmodelled import LEAST_SURE, MOST_BESIDE, SHARES, Odds
 from twin.model.effects import EFFECTS
 from twin.monitor.bins import Floats
 
@@ -56,6 +56,28 @@ def test_a_probability_is_one(ratio: float, causes: int, rivals: float) -> None:
     assert one.of_cause(causes, 0.0) + one.instead(causes, 0.0) == pytest.approx(1.0)
     assert one.of_cause(causes, rivals + 1.0) <= one.of_cause(causes, rivals)
     assert Odds(2.0 * ratio + 1.0).of_cause(causes, 0.0) <= one.of_cause(causes, 0.0) + 1e-12
+
+
+@given(st.floats(0.0, unmodelled.MOST), st.integers(1, 3), st.floats(0.0, 1e3))
+def test_a_cause_is_no_surer_than_one_beside_something_that_surely_acts(
+    ratio: float, causes: int, rivals: float
+) -> None:
+    one = Odds(ratio)
+    usual, beside = (one.of_cause(causes, rivals, is_beside=acts) for acts in (False, True))
+    assert beside <= usual + 1e-12
+    assert beside <= MOST_BESIDE + 1e-12
+    strange, least = (one.instead(causes, rivals, is_beside=acts) for acts in (False, True))
+    assert least == pytest.approx(max(strange, 1.0 - MOST_BESIDE))
+    if strange > 1.0 - MOST_BESIDE:
+        assert beside == pytest.approx(usual)
+    assert Odds(0.1).of_cause(1, 0.0, is_beside=True) == pytest.approx(MOST_BESIDE)
+
+
+def test_two_causes_that_come_and_go_are_less_sure_than_two_that_stay() -> None:
+    stay, one, two = (Odds(0.5, coming_and_going=count) for count in (0, 1, 2))
+    assert one.of_cause(2, 0.0) == stay.of_cause(2, 0.0) > 0.85
+    assert two.of_cause(2, 0.0) < 0.6
+    assert two.of_unlisted(2) > 0.4 > stay.of_unlisted(2)
 
 
 def test_what_explains_much_and_leaves_noise_is_surer_than_what_explains_little() -> None:

@@ -23,7 +23,7 @@ from twin.diagnosis.experiments import beside_weather, next_experiment
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
-from twin.diagnosis.hypotheses import hours, parameters, score_with_tempered_prior
+from twin.diagnosis.hypotheses import hours, often, parameters, score_with_tempered_prior
 from twin.diagnosis.mechanisms import Explained, explain, explain_alone
 from twin.diagnosis.residual_covariance import Covariance, ResidualWhitener, covariance
 from twin.diagnosis.search import Search, search, sharpened, stranger
@@ -142,7 +142,7 @@ def diagnose(
     if like_weather:  # what the model has wrong of such weather is smooth, and recurs as well
         probability_alone = min(probability_alone, LIKELY)
     likely = probability_alone > LIKELY or any(
-        beside.is_large(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
+        not beside.corrects_waveform(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
         for number, cause_odds in enumerate(odds)
     )
     strange = look(
@@ -151,12 +151,13 @@ def diagnose(
     # If nothing was fitted, all cycles count as held out.
     leftover = after.leftover if hypothesis else _left_in_all(evidence, healthy.of(evidence.judged))
     verdict = _verdict(hypothesis, before, after, leftover, strange, likely)
-    probabilities = _probabilities(evidence, searched, odds)
-    is_doubtful = all(probability < LEAST_SURE for probability in probabilities)
+    is_doubtful = _is_doubtful(evidence, hypothesis, _probabilities(evidence, searched, odds))
     listed_findings = _Findings(verdict, searched, hypothesis, after, strange, is_doubtful)
     findings = _with_unlisted(
         evidence, fitted, held_out, healthy, before, listed_findings, progress
     )
+    is_beside = findings.verdict == "unlisted"
+    probabilities = _probabilities(evidence, searched, odds, is_beside=is_beside)
     causes = _causes(evidence, findings.searched, probabilities, before) if findings.causes else []
     for cause, cost in zip(causes, costs(config, evidence, findings.causes, causes), strict=False):
         if cost is not None:  # a price is configured, and a size is known
@@ -460,15 +461,30 @@ def _runners_up(searched: Search) -> list[dict[str, Any]]:
 # --- causes ---------------------------------------------------------------------------------------
 
 
-def _probabilities(evidence: Evidence, searched: Search, odds: Sequence[Odds]) -> list[float]:
-    """Probability of each cause found, beside its rivals and something unlisted."""
+def _probabilities(
+    evidence: Evidence, searched: Search, odds: Sequence[Odds], *, is_beside: bool = False
+) -> list[float]:
+    """Probability of each cause found, beside its rivals and something unlisted.
+
+    ``is_beside`` says that something unlisted acts.
+    """
     if searched.found is None:
         return []
     found = searched.found
+    weights = [_weight(evidence, found, rivals) for rivals in searched.rivals]
     return [
-        cause_odds.of_cause(len(found.hypothesis), _weight(evidence, found, rivals))
-        for cause_odds, rivals in zip(odds, searched.rivals, strict=True)
+        cause_odds.of_cause(len(found.hypothesis), weight, is_beside=is_beside)
+        for cause_odds, weight in zip(odds, weights, strict=True)
     ]
+
+
+def _is_doubtful(evidence: Evidence, causes: Hypothesis, probabilities: Sequence[float]) -> bool:
+    """Whether causes are no answer where more than noise is left.
+
+    So is weather that nobody measured, since it moves everything a little, as it is on any day.
+    """
+    is_weather = len(causes) == 1 and often(evidence, causes[0]) > 1.0
+    return is_weather or all(probability < LEAST_SURE for probability in probabilities)
 
 
 def _causes(
@@ -517,7 +533,8 @@ def _unmodelled(
         return round(max(alone, LIKELY) if verdict == "unlisted" else alone, 3)
     best = searched.found
     rivals = _weight(evidence, best, searched.rivals[0])
-    return round(odds[0].instead(len(best.hypothesis), rivals), 3)
+    is_beside = verdict == "unlisted"
+    return round(odds[0].instead(len(best.hypothesis), rivals, is_beside=is_beside), 3)
 
 
 def _weight(evidence: Evidence, best: Fitted, rivals: Sequence[Fitted]) -> float:

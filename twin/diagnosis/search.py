@@ -21,7 +21,7 @@ from twin.diagnosis.evidence import (
     LogCycles,
     at_once,
 )
-from twin.diagnosis.fit import Fitted, fit, interval, white
+from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
 from twin.diagnosis.hypotheses import (
     bounds,
     by_each_law,
@@ -182,10 +182,33 @@ def _added(
         addition = _best_addition(evidence, current, singles, alone)
         if addition is None:
             break
-        current = _about(evidence, fitted, addition.hypothesis)
-        pruned = _pruned(evidence, current.weights, current.found, current.healthy)
-        current = replace(current, found=pruned)
+        current = _by_best_law(evidence, fitted, _about(evidence, fitted, addition.hypothesis))
+        current = replace(current, found=_pruned(evidence, fitted, current))
     return current
+
+
+def _by_best_law(evidence: Evidence, fitted: Sequence[int], current: _Found) -> _Found:
+    """What was found with another law of one cause, if that is clearly better by both weights.
+
+    A cause has the law that was best alone, where another cause may have been part of it.
+    """
+    found = current.found
+    others = [
+        by_law
+        for number in range(len(found.hypothesis))
+        for by_law in by_each_law(found.hypothesis, number)
+        if [cause.law() for cause in by_law] != [cause.law() for cause in found.hypothesis]
+    ]
+    if not others:
+        return current
+    best = min(
+        fit(evidence, current.weights, others, best_only=True),
+        key=lambda candidate: candidate.score,
+    )
+    if not _is_clearly_better(best, found):
+        return current
+    candidate, by_own_weights = _by_own_weights(evidence, fitted, current, best)
+    return candidate if _is_clearly_better(by_own_weights, found) else current
 
 
 def _beside_rivals(
@@ -451,19 +474,11 @@ def _started(
 
     A delay shifts edges: far from its true size, a step towards it does not reduce the misfit.
     """
-    tried: list[list[Hypothesis]] = []
-    for hypothesis in chain.from_iterable(
-        by_each_law(start, len(start) - 1) for start in hypotheses
-    ):
-        low, high = bounds(evidence, hypothesis)
-        x = sizes(evidence, hypothesis)
-        last = len(x) - len(parameters(hypothesis[-1:]))
-        around = [x]
-        tried_sizes = START_OF_TIMES if parameters(hypothesis[-1:])[0].is_time else START
-        for size in (*-tried_sizes, *tried_sizes):
-            if low[last] < size < high[last]:
-                around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
-        tried.append([sized(evidence, hypothesis, point) for point in around])
+    tried = [
+        _at_some_sizes(evidence, by_law)
+        for hypothesis in hypotheses
+        for by_law in by_each_law(hypothesis, len(hypothesis) - 1)
+    ]
     all_variants = [variant for variants in tried for variant in variants]
     chi2 = np.sum(white(evidence, judged, all_variants) ** 2, axis=0)
     best, first = [], 0
@@ -471,6 +486,19 @@ def _started(
         best.append(variants[int(np.argmin(chi2[first : first + len(variants)]))])
         first += len(variants)
     return best
+
+
+def _at_some_sizes(evidence: Evidence, hypothesis: Hypothesis) -> list[Hypothesis]:
+    """A hypothesis as it is, and with its last cause at each size from which a fit may start."""
+    low, high = bounds(evidence, hypothesis)
+    x = sizes(evidence, hypothesis)
+    last = len(x) - len(parameters(hypothesis[-1:]))
+    around = [x]
+    tried_sizes = START_OF_TIMES if parameters(hypothesis[-1:])[0].is_time else START
+    for size in (*-tried_sizes, *tried_sizes):
+        if low[last] < size < high[last]:
+            around.append(np.concatenate([x[:last], [size], x[last + 1 :]]))
+    return [sized(evidence, hypothesis, point) for point in around]
 
 
 def _best_addition(
@@ -490,6 +518,8 @@ def _best_addition(
     candidates = _started(
         evidence, judged, [(*hypothesis, *candidate.hypothesis) for candidate in new]
     )
+    if found.leftover > QUIET:
+        candidates += _far_additions(evidence, weights, found)
     if len(hypothesis) == 1:
         candidates += _linear_pairs(evidence, judged, columns(evidence, judged, alone))
         candidates += _fitted_pairs(evidence, weights, singles[:TRIED_PAIRS], found)
@@ -499,6 +529,29 @@ def _best_addition(
         if _worth(evidence, current.healthy, found.chi2, found.chi2 - found.score, candidate):
             return candidate
     return None
+
+
+def _far_additions(
+    evidence: Evidence, weights: ResidualWhitener, found: Fitted
+) -> list[Hypothesis]:
+    """What was found with one more cause throughout the log that lets the sizes found change much.
+
+    A cause that makes up for half of another hides in the other's size: where that fits best alone,
+    none of the second gains anything. So each effect is tried at several sizes, and all sizes move
+    by one step.
+    """
+    tried: list[Hypothesis] = []
+    for effect in evidence.effects:
+        together = (*found.hypothesis, Cause(effect.name, {}))
+        if _can_join(evidence, together[-1], found.hypothesis):
+            for by_law in by_each_law(together, len(together) - 1):
+                tried += _at_some_sizes(evidence, by_law)[1:]
+    chi2 = profiled(evidence, weights, tried)
+    best: dict[str, Hypothesis] = {}
+    for number in np.argsort(chi2):
+        if chi2[number] < found.chi2 - HOPEFUL:
+            best.setdefault(tried[number][-1].effect, tried[number])
+    return list(best.values())[:TRIED_MORE]
 
 
 def _can_join(evidence: Evidence, cause: Cause, others: Hypothesis) -> bool:
@@ -575,16 +628,28 @@ def _sizes_of_causes(evidence: Evidence, fitted: Fitted) -> list[float]:
     return sizes
 
 
-def _pruned(evidence: Evidence, weights: ResidualWhitener, found: Fitted, healthy: float) -> Fitted:
-    """``found`` without the causes that do not exceed their penalty beside the others."""
+def _pruned(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fitted:
+    """What was found without the causes that do not exceed their penalty beside the others.
+
+    A cause is kept as well if the others leave more than noise by weights about themselves, and are
+    clearly poorer. Weights about all causes are wide by what each may be off: one can hide in the
+    width of another.
+    """
+    found, weights = current.found, current.weights
     while len(found.hypothesis) > 1:
         without = [
             tuple(c for i, c in enumerate(found.hypothesis) if i != left_out)
             for left_out in range(len(found.hypothesis))
         ]
         best = min(fit(evidence, weights, without), key=lambda candidate: candidate.score)
-        if _worth(evidence, healthy, best.chi2, best.chi2 - best.score, found):
+        if _worth(evidence, current.healthy, best.chi2, best.chi2 - best.score, found):
             break
+        if _smallest_size(evidence, found) >= SMALLEST_MORE:
+            _, by_own_weights = _by_own_weights(evidence, fitted, current, best)
+            if by_own_weights.leftover > QUIET and _is_clearly_better(
+                found, by_own_weights, SIGNIFICANT
+            ):
+                break
         found = best
     return found
 
@@ -705,8 +770,9 @@ def _by_two_pictures(
     return [at_once(judged, of_cause) for of_cause in rivals]
 
 
-def _is_clearly_better(rival: Fitted, found: Fitted) -> bool:
-    return rival.score < found.score - CHI2_999 * max(rival.leftover**2, 1.0)
+def _is_clearly_better(rival: Fitted, found: Fitted, by: float = CHI2_999) -> bool:
+    """Whether a rival's score is lower by so much, in its chi-square per residual."""
+    return rival.score < found.score - by * max(rival.leftover**2, 1.0)
 
 
 def _rivals(

@@ -14,6 +14,7 @@ from twin.diagnosis.residual_covariance import ResidualWhitener
 from twin.diagnosis.unlisted import OVER, smooth
 from twin.inference.priors import tempered
 from twin.inference.unmodelled import MISMATCH, SHARES, SIZES, Odds, alone, log_likelihoods
+from twin.model.courses import Course
 from twin.model.effects import effect_of
 from twin.monitor.bins import Floats
 
@@ -49,14 +50,14 @@ class Unmodelled:
             for over in OVER
         ]
 
-    def is_large(self, number: int) -> bool:
-        """Whether a cause explains more than the waveforms of all are off by.
+    def corrects_waveform(self, number: int) -> bool:
+        """Whether a cause explains less than the waveforms of all are off by, and not nothing.
 
-        A smaller one may correct a waveform. So what suits its place is no evidence of something
-        unlisted.
+        Such a cause may correct a waveform. So what suits its place is no evidence of something
+        unlisted. One that moves switching levels alone corrects none.
         """
         explained = np.sqrt(np.mean((self._off - self._off[:, :1]) ** 2, axis=0))
-        return bool(explained[1 + number] > MISMATCH * explained[-1])
+        return bool(0.0 < explained[1 + number] <= MISMATCH * explained[-1])
 
     def odds(self, number: int) -> Odds:
         """Odds for the cause of this number, among those found.
@@ -67,7 +68,8 @@ class Unmodelled:
         white = [self.weights.white(course * explained) for course in self._courses]
         cause = self.found[number]
         frequency = tempered(often(self.evidence, cause))
-        return Odds.of(self._log_likelihoods(white), effect_of(cause.effect), frequency)
+        irregular = sum(found.course == Course.INTERMITTENT for found in self.found)
+        return Odds.of(self._log_likelihoods(white), effect_of(cause.effect), frequency, irregular)
 
     def alone(self) -> float:
         """Probability that something unlisted acts if no cause was found.

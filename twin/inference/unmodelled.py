@@ -21,6 +21,11 @@ MISMATCH = 0.08  # of what an effect explains, that its waveform is off
 # UNLISTED halved or doubled moves 0.96 to 0.98 or 0.93. Beside a listed effect something unlisted
 # has 0.15: of 85 causes where more was left, 53 act (tools.reliability), 0.15 to 0.1 says 0.6.
 UNLISTED, BESIDE, FURTHER = 0.1, 0.15, 0.3
+# That a cause or a look-alike acts where something unlisted does: under the verdict `unlisted`.
+MOST_BESIDE = BESIDE / (BESIDE + UNLISTED)
+# Of faults, those that come and go. Two that do, each in cycles of its own, are rather one that
+# changes from cycle to cycle, as much of what is unlisted does. Chosen, as in the battery.
+COMES_AND_GOES = 0.2
 SHARES = np.geomspace(0.003, 1.0, 9)  # of what was explained, that may be left of it
 SIZES = np.geomspace(0.003, 30.0, 13)  # of the noise, that something may have where no cause acts
 SMALLEST = 0.1  # of the noise, that something unlisted has: less would be part of the noise
@@ -58,30 +63,45 @@ MOST = 1e9  # beyond it nothing changes any more
 class Odds:
     """How well what is left of the data suits an effect that nobody listed.
 
-    ``ratio`` is its marginal likelihood beside that of a listed effect, from 0 to MOST, and
-    ``frequency`` how often that comes beside wear.
+    ``ratio`` is its marginal likelihood beside that of a listed effect, from 0 to MOST,
+    ``frequency`` how often that comes beside wear, and ``coming_and_going`` how many of the causes
+    are intermittent.
     """
 
     ratio: float
     frequency: float = 1.0
+    coming_and_going: int = 0
 
     @classmethod
-    def of(cls, log_likelihoods: Floats, cause: Effect, frequency: float) -> "Odds":
+    def of(
+        cls, log_likelihoods: Floats, cause: Effect, frequency: float, coming_and_going: int = 0
+    ) -> "Odds":
         """From the log likelihoods with each of SHARES left beside a cause, (·, shares).
 
         Courses are averaged. ``frequency`` is the cause's tempered prior one.
         """
-        return cls(_ratio(log_likelihoods, _WEATHER if cause.is_weather else _LITTLE), frequency)
+        ratio = _ratio(log_likelihoods, _WEATHER if cause.is_weather else _LITTLE)
+        return cls(ratio, frequency, coming_and_going)
 
-    def of_cause(self, causes: int, rivals: float) -> float:
-        """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it."""
+    def of_cause(self, causes: int, rivals: float, *, is_beside: bool = False) -> float:
+        """Probability that a cause acts, one of so many; ``rivals`` weigh so much beside it.
+
+        ``is_beside`` says that something unlisted acts, in place of the cause or beside it.
+        """
         beside = self._beside
-        return (1.0 + beside) / (1.0 + rivals + beside + self._instead(causes))
+        probability = (1.0 + beside) / (1.0 + rivals + beside + self._instead(causes))
+        if not is_beside:
+            return probability
+        return probability * min(MOST_BESIDE / (1.0 - self.instead(causes, rivals)), 1.0)
 
-    def instead(self, causes: int, rivals: float) -> float:
-        """Probability that something unlisted acts in place of a cause, one of so many."""
+    def instead(self, causes: int, rivals: float, *, is_beside: bool = False) -> float:
+        """Probability that something unlisted acts in place of a cause, one of so many.
+
+        ``is_beside`` as for ``of_cause``.
+        """
         strange = self._instead(causes)
-        return strange / (1.0 + rivals + self._beside + strange)
+        probability = strange / (1.0 + rivals + self._beside + strange)
+        return max(probability, 1.0 - MOST_BESIDE) if is_beside else probability
 
     def of_unlisted(self, causes: int) -> float:
         """Probability that something acts that nobody listed, beside or instead of a cause."""
@@ -94,7 +114,11 @@ class Odds:
         return BESIDE * self.ratio / max(self.frequency, 1.0)
 
     def _instead(self, causes: int) -> float:
-        return UNLISTED * self.ratio / self.frequency / FURTHER ** (causes - 1)
+        """Weight of something unlisted in place of a cause, one of so many."""
+        at_once: float = FURTHER ** (causes - 1) * COMES_AND_GOES ** max(
+            self.coming_and_going - 1, 0
+        )
+        return UNLISTED * self.ratio / self.frequency / at_once
 
 
 def alone(log_likelihoods: Floats) -> float:
