@@ -4,22 +4,20 @@ import numpy as np
 import pytest
 
 from tools.false_alarms import (
-    DAYS,
     PATH_OF,
-    WANTED_CYCLE_S,
     WITHIN,
     Device,
     Rate,
     is_as_set,
     of_limits,
+    of_sums,
     table,
 )
-from tools.splitting import SETTLES, rate
+from tools.importance_sampling import BEGINS, Weighing, times_wanted
 from twin.alarms.rules import default_rules
 from twin.figures.settings import LIMITED
-from twin.monitor.change_detection import SHARES, SIZES, ChangeDetector, limit
-from twin.monitor.false_alarm_budget import LIMITS, SINGLE_CYCLES, SUMS, cycles_between
-from twin.monitor.isolation import looked_for
+from twin.monitor.change_detection import ChangeDetector, limit
+from twin.monitor.false_alarm_budget import LIMITS, SINGLE_CYCLES, SUMS
 from twin.monitor.model_bank import SUSPECTS
 
 
@@ -41,52 +39,33 @@ def test_every_alarm_is_counted_or_no_judgement_of_cycles() -> None:
     assert set(PATH_OF) == {rule.name for rule in default_rules()}
 
 
-def times_of_normal_scores(wanted: float, devices: int = 400, begins: int = 200) -> float:
-    """Alarms of sums over the wanted number if scores are normal, by importance sampling.
-
-    In each device a change of the detector's own sizes begins at a drawn cycle. An alarm counts as
-    the inverse of its likelihood ratio to no change, which is the statistic itself. All suspects
-    and signs are alike here, so it does not matter which of them change.
-    """
-    rng, changes = np.random.default_rng(1), looked_for()
-    changes.weigh(np.eye(len(SUSPECTS)))
-    changes.take(np.full((devices, len(SUSPECTS)), np.nan))
-    suspect, first = rng.integers(len(SUSPECTS), size=devices), rng.integers(begins, size=devices)
-    size = rng.choice(SIZES, size=devices, p=SHARES)
-    times = np.zeros(devices)
-    for cycle in range(begins + 300):
-        scores = rng.standard_normal((devices, len(SUSPECTS)))
-        scores[np.arange(devices), suspect] += size * (cycle >= first)
-        changes.take(scores)
-        sums = changes.log_sums
-        times = np.where(
-            (times == 0.0) & (sums >= limit(wanted)), np.exp(np.log(wanted) - sums), times
-        )
-    assert np.all(times > 0.0)
-    return float(times.mean())
-
-
 def test_the_shares_are_one_budget_that_sums_use_up() -> None:
     """Sums of normal scores alone raise about as many false alarms as are set."""
-    times = times_of_normal_scores(cycles_between(DAYS, SUMS, WANTED_CYCLE_S))
-    assert 1.0 / WITHIN < SUMS * times < WITHIN
+    scores = np.random.default_rng(1).standard_normal((20_000, len(SUSPECTS)))
+    alike = np.eye(len(SUSPECTS))
+    normal = Device(scores, alike, np.empty(0), 0, np.empty((0, 0)), np.empty((0, 0)), 0)
+    found = of_sums([normal], seed=1, runs=300, anew=1)
+    assert 1.0 / WITHIN < SUMS * found.times < WITHIN
     assert pytest.approx(1.0) == SUMS + SINGLE_CYCLES + LIMITS
 
 
-def test_splitting_counts_as_many_alarms_as_come_without() -> None:
-    rng, wanted, devices, cycles = np.random.default_rng(2), 500.0, 300, 600
-    scores = rng.standard_normal((50_000, 4))
-    changes = ChangeDetector(np.ones(4, bool), np.ones(4))
-    found = rate(scores, changes, wanted, rng, devices=100, cycles=SETTLES + cycles)
+def test_importance_sampling_counts_as_many_alarms_as_come() -> None:
+    """Scores with a short tail raise fewer alarms than normal ones, counted either way."""
+    rng, wanted, devices, cycles = np.random.default_rng(2), 5000.0, 300, 2000
+    scores = rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), (20_000, 4))
+    changes, weighing = (kind(np.ones(4, bool), np.ones(4)) for kind in (ChangeDetector, Weighing))
+    found = times_wanted(scores, changes, weighing, wanted, rng, 500)
     changes.begin()
-    alarms = 0
     changes.take(np.full((devices, 4), np.nan))
-    for cycle in range(SETTLES + cycles):
-        changes.take(rng.standard_normal((devices, 4)))
+    alarms = 0
+    for cycle in range(cycles):
+        changes.take(scores[rng.integers(len(scores), size=devices)])
         raised = changes.log_sums >= limit(wanted)
-        alarms += int(raised.sum()) if cycle >= SETTLES else 0
+        alarms += int(raised.sum()) if cycle >= BEGINS else 0
         changes.begin_some(raised)
-    assert found.times == pytest.approx(alarms * wanted / devices / cycles, rel=0.2)
+    plain = alarms * wanted / devices / (cycles - BEGINS)
+    assert found == pytest.approx(plain, rel=0.3)
+    assert found < 0.8
 
 
 def with_t1(limit_ms: float) -> Device:

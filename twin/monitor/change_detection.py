@@ -186,10 +186,6 @@ class ChangeDetector:
         """Reset the statistics of some devices, if scores of several are taken at once."""
         self._log[devices] = -np.inf
 
-    def go_on_with(self, devices: npt.NDArray[np.int64]) -> None:
-        """Keep the statistics of these devices alone, in this order; one may come several times."""
-        self._log = self._log[devices]
-
     def take(self, normal: Floats, most: float = MOST) -> None:
         """Take the standard normal scores of a cycle; NaN changes nothing.
 
