@@ -134,8 +134,10 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
         * (1.0 - drained)
         * theta[c.BLOW_OFF]
         * (1.0 + theta[c.BLOW_OFF_SHAPE] * (1.0 - port / ambient))
+        * (supply + ambient)
+        / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
+        + theta[c.PORT_INFLOW]
     )
-    blown *= (supply + ambient) / (theta[c.SUPPLY_NOMINAL] + theta[c.AMBIENT_NOMINAL])
     if port < ambient:
         blown += through_hole(theta[c.BACK_FLOW] * (1.0 - min(jet, 1.0)), port, ambient)
     hole, pore = theta[[c.LEAK, c.LAMINAR_LEAK]] + (valves.open or 0.0) * theta[[c.HOLE, c.OPENING]]

@@ -90,9 +90,10 @@ def test_a_whole_cycle_is_within_half_a_pascal_of_the_exact_solution(
     assert np.abs(expected - exact[:, kernel.SENSED]).max() < 0.5
 
 
-def test_so_it_is_where_gas_convects_behind_a_check_valve() -> None:
+def test_so_it_is_where_gas_convects_behind_a_check_valve_and_a_blow_off_valve_leaks() -> None:
     theta = closed(tube_film_coefficient=60.0, film_coefficient=20.0, leak_sl_min=0.3)
     theta[[c.CRACKING_PRESSURE, c.EXHAUST]] = 8.0 * MBAR, 100.0 * SL_MIN
+    theta[c.PORT_INFLOW] = 2.0 * SL_MIN
     theta[[c.FREE_CONVECTION, c.FORCED_CONVECTION]] = 0.9, 4.0 / theta[c.BLOW_OFF]
     phases = cycle_of("test_rig")
     expected = advance(theta, phases)

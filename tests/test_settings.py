@@ -260,6 +260,7 @@ def test_every_coefficient_is_filled_in() -> None:
     effects = {
         "LAMINAR_LEAK",
         "INFLOW",
+        "PORT_INFLOW",
         "BACK_FLOW",
         "SENSOR_OFFSET",
         "GAUGE",

@@ -51,7 +51,7 @@ RIGHT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "filling_silencer": (("end_pressure", "nozzle"), ("nozzle_on_slowly",)),
     "creeping_cup": (("volume",), ("beyond_slowly", "nozzle_on_slowly")),
     "cup_backlash": (("volume",), ("above", "beyond", "beyond_slowly")),
-    "blow_off_valve_leak": (("inflow",), ("always",)),
+    "blow_off_valve_leak": (("port", "inflow"), ("always",)),
     "adsorbed_moisture": (AIR, ("used_up",)),
     "outgassing": (AIR, ("used_up",)),
     "sensor_thermal_drift": (("sensor",), ("warming_up",)),
@@ -73,7 +73,7 @@ SIZES = {
     "second_ejector": {"supply": "drop"},
     "filling_silencer": {"end_pressure": "end_pressure_rise"},
     "creeping_cup": {"volume": "volume_at_full_vacuum"},
-    "blow_off_valve_leak": {"inflow": "flow"},
+    "blow_off_valve_leak": {"port": "flow", "inflow": "flow"},
     "sensor_thermal_drift": {"sensor": "offset"},
     "sticking_valve": {"response_delay": "delay"},
 }

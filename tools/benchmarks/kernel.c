@@ -23,7 +23,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, CREEP, CREEP_TIME, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE,
-    RESISTANCE, LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, BACK_FLOW,
+    RESISTANCE, LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, PORT_INFLOW, BACK_FLOW,
     OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR, SENSOR_OFFSET, GAUGE, SENSOR_GAIN, H1, H1_LOW, H1_FOLLOWS, H2, H2_LOW,
     RELEASE, CONTACT, CONTROL_SENSOR, AIR_SAVING, PERMITTED_LEAKAGE, BLOW_OFF_MODE,
     BLOW_OFF_TIME, COEFFICIENTS
@@ -177,7 +177,7 @@ INLINED Port at_port(double p, const Driven *driven, const double *k)
     back = p < ambient ? back : 0.0;
     double vent = p > opens ? K(EXHAUST) : 0.0;
     double fuller = driven->blow_off * K(BLOW_OFF_SHAPE);
-    double blown = driven->blow_off + fuller * (1.0 - p / ambient) + back * flow.level;
+    double blown = driven->blow_off + fuller * (1.0 - p / ambient) + back * flow.level + K(PORT_INFLOW);
     double blown_slope = min(back * flow.slope - fuller / ambient, 0.0);
     return (Port){
         out - relief * relieves - vent * (flow.level - flow.slope * p),

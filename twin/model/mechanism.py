@@ -142,6 +142,14 @@ PLACES = {
             ("inflow",),
         ),
         Place(
+            "port",
+            (c.PORT_INFLOW,),
+            (_P("flow", "sl/min", 0.0, 60.0, 1.0),),
+            (_flowing,),
+            "air flows into the port of the ejector at a rate of its own",
+            ("inflow at the port",),
+        ),
+        Place(
             "opening",
             (c.LEAK,),
             (_P("sonic_flow", "sl/min", -30.0, 60.0, 1.0),),
@@ -371,12 +379,14 @@ _SIGNED = {c.INFLOW, c.SENSOR_OFFSET}  # coefficients that may be negative
 # Conditions that only some places have. At other places, mechanisms that always act are effects of
 # the table; a period comes from a compressor or from another consumer.
 _ONLY = {
-    "always": {"inflow"},
+    "always": {"inflow", "port"},
     "swinging": {"supply", "inflow"},
     "pulsed": {"supply", "inflow"},
 }
-# Conditions that a place lacks, because a log would not show them.
+# Conditions that a place lacks, because a log would not show them, or because it is told there by
+# an effect or by another place: only a valve that never closes lets air into the port.
 _NOT = {
+    "port": set(WHENS) - {"always"},
     "nozzle": {"nozzle_off", "in_blow_off"},
     "blow_off": {"nozzle_on", "nozzle_off", "nozzle_on_slowly", "above", "used_up"},
     "suction": {"nozzle_off", "in_blow_off"},

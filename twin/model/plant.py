@@ -244,8 +244,8 @@ def port_flows(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, fl
 
     Out: the suction of the ejector, and the exhaust if the port is far enough above ambient to open
     the check valve; its opening pressure is lost to the flow. A jet that is still building up has
-    less flow and a higher end pressure. In: blow-off, and back-flow through a leaking check valve
-    while the nozzle is off.
+    less flow and a higher end pressure. In: blow-off, what a valve lets in that does not close, and
+    back-flow through a leaking check valve while the nozzle is off.
     """
     ambient = k[c.AMBIENT, i]
     per_pa = 1.0 / (ambient - driven.end)
@@ -263,7 +263,7 @@ def port_flows(p: float, driven: Driven, k: Prepared, i: int) -> tuple[float, fl
     vent = k[c.EXHAUST, i]
     vent = vent if p > opens else 0.0
     fuller = driven.blow_off * k[c.BLOW_OFF_SHAPE, i]
-    blown = driven.blow_off + fuller * (1.0 - p / ambient) + back * share
+    blown = driven.blow_off + fuller * (1.0 - p / ambient) + back * share + k[c.PORT_INFLOW, i]
     # A positive slope could make the port's balance negative: then the flow is constant.
     blown_slope = min(back * rise - fuller / ambient, 0.0)
     return (
