@@ -34,6 +34,7 @@ from twin.diagnosis.mechanisms import Explained, explain_alone, is_a_course_of
 from twin.diagnosis.pictures import Found
 from twin.diagnosis.propose import Proposal, _range, proposed
 from twin.diagnosis.report import _law_holds, draw, write_report
+from twin.diagnosis.residual_covariance import levels
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
 from twin.languages.choice import language_of
@@ -367,6 +368,19 @@ def test_what_swings_is_not_stored_and_is_judged_on_another_log_in_phase_with_th
     judged = judged_on(diagnosis, config, "other.mcap", [late[850:]])  # half a period later
     assert judged is not None
     assert judged["extended"]["rms_mbar"] < 0.8 * judged["baseline"]["rms_mbar"]
+
+
+def test_what_depends_on_the_time_in_the_log_moves_levels_as_it_is_at_each_switching() -> None:
+    """They are simulated from a cold start: there a sensor is cold, and a rhythm just begins."""
+    samples, _ = rigs.recorded("gripper", 24.0, ("sensor_thermal_drift=14",), 3)
+    evidence = collect(rigs.config("gripper"), [samples])
+    warms_up = Cause("sensor_warming_up", {"offset": 14.0, "sets_in": 15.0})
+    pulse = Cause("supply_pulsed", {"drop": 1.0, "period": 2.9, "duty": 40.0, "shift": 0.0})
+    tried = [HEALTHY, (warms_up,), (pulse,)]
+    plain, drifting, pulsing = levels(evidence, evidence.judged, tried).T
+    assert np.abs(plain).max() > 6.0
+    assert np.abs(drifting).max() < 2.0
+    assert np.array_equal(pulsing, plain)
 
 
 @cache

@@ -18,8 +18,10 @@ from twin.inference import whitening as parts
 from twin.inference.sensitivities import central, derivatives
 from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c
+from twin.model.catalogue import mechanism_of
 from twin.model.courses import Cause, Course, Schedule
-from twin.model.effects import WEATHER
+from twin.model.effects import WEATHER, effect_of
+from twin.model.mechanism import MECHANISMS, PLACES, RHYTHMIC, WHENS, Mechanism
 from twin.model.theta import Theta
 from twin.monitor.another_day import unsure
 from twin.monitor.bins import Bins, Floats, Ints
@@ -50,6 +52,10 @@ MEETS = BREAK_COLUMNS[0] + 1
 # uncertainty by another weather never shows in them.
 UNSEEN = 3.0
 _INTO = (Phase.HOLD, Phase.SUCTION)  # the phase after each of LEVELS
+WARMING_SENSOR = Mechanism(PLACES["sensor"], WHENS["warming_up"]).name
+# Mechanisms that act at each switching otherwise, by the time in the log alone.
+OF_THE_LOG = {one.name for one in MECHANISMS.values() if one.when.code in RHYTHMIC}
+OF_THE_LOG |= {WARMING_SENSOR}
 LEVEL_MBAR = 0.5  # sigma of a switching level, common to all cycles
 
 
@@ -325,11 +331,21 @@ def scatter(evidence: Evidence) -> dict[str, tuple[str, float]]:
 
 
 def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypothesis]) -> Floats:
-    """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses)."""
+    """Measured minus expected switching levels (mbar) of cycles, (levels, hypotheses).
+
+    The switching is simulated from a cold start. So what depends on the time in the log is left
+    out there: a rhythm, and a sensor that warms up. What this reads more at each switching is
+    added.
+    """
     shown = _shown(evidence, cycles)
     at = np.array(
         [evidence.switching_row(cycle, _INTO[number]) for cycle, number in shown], np.int64
     )
+    drifts = [_drift(evidence, at, hypothesis) for hypothesis in hypotheses]
+    hypotheses = [
+        tuple(cause for cause in hypothesis if mechanism_of(cause.effect) not in OF_THE_LOG)
+        for hypothesis in hypotheses
+    ]
     nodes = [_nodes(evidence, at, hypothesis) for hypothesis in hypotheses]
     thetas = [
         [_coefficients_at(course, row) for row in rows]
@@ -348,7 +364,26 @@ def levels(evidence: Evidence, cycles: Sequence[int], hypotheses: Sequence[Hypot
             deviations[of_level, i] = relative[of_level] - np.interp(
                 at[of_level], rows, seen[:, level_number]
             )
+        deviations[:, i] += drifts[i]
     return deviations
+
+
+def _drift(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Floats:
+    """What a sensor that warms up reads more (mbar) in the rows ``at``.
+
+    A control that acts on the same sensor switches at the same reading: then it is nothing.
+    """
+    drift = np.zeros(len(at))
+    apart = evidence.theta[c.CONTROL_SENSOR] == c.OWN
+    for cause in hypothesis:
+        if not apart or mechanism_of(cause.effect) != WARMING_SENSOR:
+            continue
+        values = {
+            p.name: cause.values.get(p.name, p.neutral(evidence.theta))
+            for p in effect_of(cause.effect).parameters
+        }
+        drift += values["offset"] * (1.0 - np.exp(-evidence.clock[at] / values["sets_in"]))
+    return drift
 
 
 def _nodes(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Ints:

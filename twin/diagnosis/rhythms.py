@@ -31,7 +31,7 @@ MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of
 LONGEST_PERIOD = {p.name: p.high for p in WHENS["pulsed"].parameters}["period"]  # s
 PHASES = 24  # parts of a period: a box begins and ends between two of them
 EARLIEST = 0.25  # periods: a first period that begins later leaves the fit room on both sides
-REFINED = {"xatol": 1e-4, "fatol": 1e-2, "maxiter": 300}  # sizes of a box in units of the log
+ENOUGH, ITERATIONS = 0.01, 300  # chi-square to which a box is refined; at most
 
 
 def rhythmic_starts(
@@ -117,7 +117,7 @@ class _Answers:
         parts = _divided(
             off[:, 1:] - off[:, :1], evidence.bins.mean(evidence.clock), period, weights.bins
         )
-        begins = width * np.arange(parts.shape[1])
+        begins = width * np.arange(parts.shape[1], dtype=np.float64)
         answers = weights.white(parts)
         seen = answers.any(axis=0)
         residuals = white(evidence, weights, [causes])[:, 0]
@@ -127,7 +127,8 @@ class _Answers:
         """Answer to a rhythm that is on for a share ``duty`` of its period, from ``shift`` on."""
         ends = np.array([self.begins, self.begins + self.width]) - shift
         begun, over = _on(ends / period, duty)
-        return self.answers @ ((over - begun) * period / self.width)
+        moved: Floats = self.answers @ ((over - begun) * period / self.width)
+        return moved
 
 
 def _divided(answers: Floats, time: Floats, period: float, bins: Ints) -> Floats:
@@ -243,11 +244,15 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
     found = list[tuple[float, ...]]()
     for i in _peaks(spectra.of_box):
         frequency, (first, number) = float(spectra.frequencies[i]), spectra.box[i]
-        start = np.array([frequency, number / PHASES, first / PHASES - middle * frequency % 1.0])
+        phase = first / PHASES - middle * frequency % 1.0
+        start: Floats = np.array([frequency, number / PHASES, phase], np.float64)
         step = (spectra.frequencies[1] - spectra.frequencies[0]) / 2.0
         simplex = start + np.vstack([np.zeros(3), np.diag([step, 1.0 / PHASES, 1.0 / PHASES])])
         best = minimize(
-            misfit, start, method="Nelder-Mead", options={**REFINED, "initial_simplex": simplex}
+            misfit,
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "fatol": ENOUGH, "maxiter": ITERATIONS},
         )
         period, duty, shift = shape(best.x)
         earliest = EARLIEST * period
