@@ -126,9 +126,10 @@ _BEGINS = _P("begins", "mbar", 20.0, 900.0, 40.0)
 _BELOW = _P("ends_below", "mbar", 1.0, 400.0, 2.0, ratio=True)
 _SETS_IN = _P("sets_in", "s", 0.02, 600.0, 1.5, ratio=True)
 _FADES = _P("fades", "s", 0.02, 600.0, 1.5, ratio=True)
-_PERIOD = _P("period", "s", 0.2, 120.0, 1.1, ratio=True)
-_SHIFT = _P("shift", "s", 0.0, 120.0, 0.2, is_of_the_log=True)
-_DUTY = _P("duty", "%", 2.0, 98.0, 5.0)
+# Of a rhythm: the clock of the rows shows it, and no equation of the plant has a part in it.
+_PERIOD = _P("period", "s", 0.2, 120.0, 1.1, ratio=True, relative_error=0.0)
+_SHIFT = _P("shift", "s", 0.0, 120.0, 0.2, is_of_the_log=True, relative_error=0.0)
+_DUTY = _P("duty", "%", 2.0, 98.0, 5.0, relative_error=0.0)
 
 PLACES = {
     place.name: place
