@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from twin.diagnosis.drawing import AFTER, BAND, MEASURED, QUIET, Picture, empty, legend
 from twin.diagnosis.evidence import Evidence
+from twin.diagnosis.mechanism_share import in_bins
 from twin.diagnosis.pictures import Found
 from twin.diagnosis.residual_covariance import covariance, levels
 from twin.diagnosis.text import mechanism_of, spoken
@@ -186,12 +187,8 @@ def _by_row(evidence: Evidence, group: Ints) -> Ints:
 def _driven(diagnosed: Found, mechanism: m.Mechanism) -> tuple[Floats, Floats, str]:
     """Value of the driver and share in each bin, and the driver's name with its unit."""
     evidence, hypothesis = diagnosed.evidence, diagnosed.causes
-    used = np.flatnonzero(evidence.bins.number >= 0)
-    begins = np.searchsorted(evidence.bins.number[used], np.arange(len(evidence.bins.count)))
-    rows = used[begins + evidence.bins.count // 2]
-    slot = _slot(evidence.course(hypothesis[:-1])[0][1], evidence.course(hypothesis)[0][1])
-    states = evidence.states(hypothesis, rows)
-    share, code = states[kernel.ACTS + slot], mechanism.when.code
+    inside, code = in_bins(evidence, hypothesis), mechanism.when.code
+    rows, states, share = inside.rows, inside.states, inside.share
     if code in (m.ABOVE, m.BEYOND):
         vacuum = (float(evidence.theta[c.AMBIENT]) - states[kernel.VESSEL]) / MBAR
         return vacuum, share, tr("vacuum in the vessel (mbar below ambient)")
@@ -201,13 +198,6 @@ def _driven(diagnosed: Found, mechanism: m.Mechanism) -> tuple[Floats, Floats, s
         return phase, share, tr("time in the rhythm (s)")
     elapsed, label = _elapsed(evidence, code)
     return elapsed[rows], share, label
-
-
-def _slot(without: Theta, with_it: Theta) -> int:
-    """The slot that differs."""
-    firsts = [m.slot_at(number) for number in range(m.SLOTS)]
-    sizes = [[first + m.SIZE, first + m.ALSO_SIZE] for first in firsts]
-    return int(np.argmax([(without[own] != with_it[own]).any() for own in sizes]))
 
 
 def _elapsed(evidence: Evidence, code: int) -> tuple[Floats, str]:

@@ -13,9 +13,11 @@ from scipy.optimize import lsq_linear
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.fit import Fitted, fit, interval, white
+from twin.diagnosis.mechanism_share import in_bins
 from twin.diagnosis.residual_covariance import ResidualWhitener, covariance
 from twin.diagnosis.rhythms import rhythmic_starts
 from twin.inference.levels import CHI2_999
+from twin.inference.unmodelled import MISMATCH
 from twin.model import theta as c
 from twin.model.catalogue import has_room
 from twin.model.courses import Cause
@@ -55,6 +57,9 @@ APART = 0.5
 # A threshold is crossed between two rows, so the misfit is a step function of it, and a fit stops
 # at a step. Changes of thresholds (in typical sizes) that are tried from there, and rounds of it.
 AFAR, LEAPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0), 4
+# A mechanism hardly varies if its least share is above so much of its largest. That is two sigmas
+# of what the law of a listed effect is off by: no law is known better.
+STEADY = 1.0 - 2.0 * MISMATCH
 # Groups of coefficients with the same meaning for a plant: inflows, and resistances of the line.
 ALIKE = ({c.LEAK, c.LAMINAR_LEAK, c.INFLOW}, {c.NEAR_RESISTANCE, c.RESISTANCE})
 
@@ -101,29 +106,48 @@ def explain_alone(
         return None
     progress("trying mechanisms")
     ranked = _best(evidence, fitted, HEALTHY, progress)
-    if any(is_a_course_of(evidence.theta, ranked[0].hypothesis[-1], cause) for cause in causes):
+    if _is_listed(evidence, fitted, ranked[0].hypothesis, causes):
         return None
     by_itself = _explained(evidence, fitted, HEALTHY, ranked)
     displaces = by_itself and (not causes or _displaces(evidence, fitted, by_itself, causes))
     return by_itself if displaces else None
 
 
-def is_a_course_of(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
-    """Whether a mechanism is a listed cause that acts at other times.
+def _is_listed(
+    evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis, causes: Hypothesis
+) -> bool:
+    """Whether a mechanism, which ends a hypothesis, is one of some listed causes.
 
-    It then acts at all times, on coefficients that the cause acts on. Those of a group of ALIKE
-    count as the same.
+    It acts where the cause does. It only warms up: then it is the cause with another course. Or it
+    hardly varies, and there is no other cause: then it is the cause by another law.
     """
-    definition, effect = MECHANISMS[mechanism.effect], effect_of(cause.effect)
-    if definition.when.code != ALWAYS:
+    mechanism = hypothesis[-1]
+    if not any(acts_where(evidence.theta, mechanism, cause) for cause in causes):
         return False
+    if MECHANISMS[mechanism.effect].when.code == ALWAYS:
+        return True
+    return len(causes) == 1 and hardly_varies(evidence, fitted, hypothesis)
+
+
+def acts_where(theta: Theta, mechanism: Cause, cause: Cause) -> bool:
+    """Whether a mechanism acts on coefficients that a listed cause acts on.
+
+    Those of a group of ALIKE count as the same.
+    """
+    effect = effect_of(cause.effect)
     moved = theta.copy()
     effect.act(moved, *(p.after(1.0, theta) for p in effect.parameters))
     changed = set(np.flatnonzero(moved != theta).tolist())
-    similar = set(definition.place.coefficients)
+    similar = set(MECHANISMS[mechanism.effect].place.coefficients)
     for group in ALIKE:
         similar |= group if similar & group else set()
     return not changed.isdisjoint(similar)
+
+
+def hardly_varies(evidence: Evidence, cycles: Sequence[int], hypothesis: Hypothesis) -> bool:
+    """Whether a mechanism, which ends a hypothesis, acts nearly evenly throughout ``cycles``."""
+    share = in_bins(evidence, hypothesis).share[np.isin(evidence.bins.cycle, cycles)]
+    return bool(share.min() > STEADY * share.max())
 
 
 def _displaces(
