@@ -309,8 +309,8 @@ def test_hypotheses_in_a_bank_are_as_each_alone() -> None:
     ways = directions(data)
     bank = [with_values(data, values(data) + 0.3 * ways[:, direction]) for direction in range(9)]
     theta = np.stack([coefficients(data) for data in bank], axis=1)
-    alone = [cycles.off(theta[:, [direction]])[:, 0] for direction in range(9)]
-    assert cycles.off(theta) == pytest.approx(np.stack(alone, axis=1), abs=2.0)  # Pa
+    alone = [cycles.residuals(theta[:, [direction]])[:, 0] for direction in range(9)]
+    assert cycles.residuals(theta) == pytest.approx(np.stack(alone, axis=1), abs=2.0)  # Pa
 
 
 def test_warped_time_runs_on_slower_and_slower() -> None:

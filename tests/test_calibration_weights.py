@@ -28,7 +28,7 @@ def cycles(every: int = 1) -> Cycles:
 def with_residual(residual: Floats, every: int = 1) -> Cycles:
     """The cycles as if the model were off by ``residual`` (Pa) in each bin, and by noise."""
     known = cycles(every)
-    expected = known.measured - known.off(THETA[:, None])[:, 0]
+    expected = known.measured - known.residuals(THETA[:, None])[:, 0]
     noise = np.random.default_rng(5).normal(0.0, NOISE / np.sqrt(known.bins.count))
     return replace(known, measured=expected + residual + noise)
 
@@ -61,7 +61,7 @@ def sigma_of(direction: Floats, fitted: Cycles) -> float:
 def effect(name: str, parameter: str, size: float, every: int = 1) -> Floats:
     """Change of the residuals (Pa) by an effect."""
     _, changes = sensitivities(
-        lambda at: cycles(every).off(coefficients_at(THETA, [(name, {parameter: size})], at)),
+        lambda at: cycles(every).residuals(coefficients_at(THETA, [(name, {parameter: size})], at)),
         np.zeros(1),
         np.ones(1),
     )

@@ -272,7 +272,7 @@ def test_vacuum_is_below_ambient_and_deviation_is_the_pressures(sides: dict[str,
     leaks = sides["leaks"]
     at = round(0.3 / BIN_S)
     gap = leaks.expected_vacuum.mean[at] - leaks.measured_vacuum.mean[at]
-    assert leaks.off.mean[at] == pytest.approx(gap, abs=1e-3)
+    assert leaks.deviation_curve.mean[at] == pytest.approx(gap, abs=1e-3)
     assert 600.0 < leaks.measured_vacuum.mean[at] < 750.0
     assert rigs.config("gripper").data.ambient.pressure_mbar * MBAR > 90_000.0
 

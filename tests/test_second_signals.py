@@ -225,7 +225,7 @@ def test_the_second_pressure_is_that_of_the_end_where_it_is_measured() -> None:
         second = Cycles.found(samples, data).of_second(end)
         other = Cycles.found(samples, data).of_second("vessel" if end == "port" else "port")
         theta = coefficients(data).reshape(-1, 1)
-        right, wrong = (np.abs(evidence.off(theta)).max() for evidence in (second, other))
+        right, wrong = (np.abs(evidence.residuals(theta)).max() for evidence in (second, other))
         assert right < 1.0 * MBAR < 5.0 * MBAR < wrong
 
 
@@ -234,7 +234,7 @@ def test_a_second_sensor_may_be_slower_than_the_first(slow_ms: float) -> None:
     samples, data = modelled(LONG_LINE, 1.0, slow_ms)
     second = Cycles.found(samples, data).of_second("vessel").as_slow(coefficients(data))
     assert second.lag == pytest.approx(slow_ms * MS)
-    assert np.abs(second.off(coefficients(data).reshape(-1, 1))).max() < 1.0 * MBAR
+    assert np.abs(second.residuals(coefficients(data).reshape(-1, 1))).max() < 1.0 * MBAR
 
 
 def test_rows_without_a_second_pressure_are_in_none_of_its_bins() -> None:
@@ -245,7 +245,7 @@ def test_rows_without_a_second_pressure_are_in_none_of_its_bins() -> None:
     assert (holes.bins.number[5::7] == -1).all()
     assert holes.bins.count.sum() < whole.bins.count.sum()
     theta = coefficients(data).reshape(-1, 1)
-    assert np.abs(holes.off(theta)).max() < 1.0 * MBAR
+    assert np.abs(holes.residuals(theta)).max() < 1.0 * MBAR
     assert np.abs(holes.unsure).max() == pytest.approx(np.abs(whole.unsure).max(), rel=0.3)
 
 

@@ -114,11 +114,11 @@ class Cycles:
         fit ``theta`` best.
         """
         early = range(-self.most_early, self.most_early + 1)
-        off = self.off(np.repeat(theta[:, None], len(early), axis=1), early)
-        usable = np.isfinite(off).all(axis=1) & (self.bins.cycle >= 1)
-        mean_square = np.average(off[usable] ** 2, axis=0, weights=self.bins.count[usable])
+        residuals = self.residuals(np.repeat(theta[:, None], len(early), axis=1), early)
+        usable = np.isfinite(residuals).all(axis=1) & (self.bins.cycle >= 1)
+        mean_square = np.average(residuals[usable] ** 2, axis=0, weights=self.bins.count[usable])
         best = int(np.argmin(mean_square))
-        return early[best], off[:, best]
+        return early[best], residuals[:, best]
 
     def control_pressure(self, theta: Theta, early: int) -> Floats:
         """Pressure (Pa) of each row that the ejector's own control acts on; NaN where unusable.
@@ -150,11 +150,11 @@ class Cycles:
     def as_slow(self, theta: Theta) -> "Cycles":
         """These cycles with the lag of LAGS for which the model of ``theta`` fits best."""
         slow = [replace(self, lag=float(lag))._sensed(theta) for lag in LAGS]
-        off = self.off(np.stack(slow, axis=1))
-        residual = np.abs(off - self.unsure @ np.linalg.lstsq(self.unsure, off)[0])
-        return replace(self, lag=float(LAGS[np.average(residual, axis=0).argmin()]))
+        residuals = self.residuals(np.stack(slow, axis=1))
+        left = np.abs(residuals - self.unsure @ np.linalg.lstsq(self.unsure, residuals)[0])
+        return replace(self, lag=float(LAGS[np.average(left, axis=0).argmin()]))
 
-    def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
+    def residuals(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """Measured minus expected pressure (Pa) in each bin for hypotheses, (coefficients, n).
 
         ``early``: for each hypothesis, rows by which the nozzle switches before it is seen to.
@@ -170,8 +170,8 @@ class Cycles:
         def run(part: slice) -> Floats:
             phases = phase[:, part] if moved else phase
             expected = _expected(theta[:, part], dt, phases, level, self.tolerance)
-            off: Floats = self.measured[:, None] - self.bins.through(drawn, expected)
-            return off
+            residuals: Floats = self.measured[:, None] - self.bins.through(drawn, expected)
+            return residuals
 
         half = -(-theta.shape[1] // (2 * kernel.LANES)) * kernel.LANES
         parts = [slice(None, half), slice(half, None)] if half < theta.shape[1] else [slice(None)]
@@ -216,9 +216,11 @@ class Both:
         """Rows by which the nozzle may be seen early or late."""
         return self.first.most_early
 
-    def off(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
+    def residuals(self, theta: Floats, early: Sequence[int] = ()) -> Floats:
         """As in ``Cycles``."""
-        return np.concatenate([self.first.off(theta, early), self.second.off(theta, early)])
+        return np.concatenate(
+            [self.first.residuals(theta, early), self.second.residuals(theta, early)]
+        )
 
 
 def _switched(commanded_phase: Bytes, nozzle_switchings: Sequence[Switching]) -> Bytes:

@@ -134,8 +134,10 @@ class Problem:
         n = len(self.space.free)
         moved = [self.space.at(point) for point in points[:n].T]
         early = np.rint(points[n:] * self._rows).astype(int).ravel().tolist()
-        off = self.cycles.off(np.stack([coefficients(data) for data in moved], axis=1), early)
-        white = np.concatenate([*self.weights.white(off), points])
+        residuals = self.cycles.residuals(
+            np.stack([coefficients(data) for data in moved], axis=1), early
+        )
+        white = np.concatenate([*self.weights.white(residuals), points])
         if self.space.everywhere:
             return white
         return np.concatenate([white, np.stack([_rising(data) for data in moved], axis=1)])
@@ -422,12 +424,14 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     x = np.clip(x, space.low, space.high)
     best = DataSet.model_validate(falling(space.at(x)).model_dump())
     slopes = space.slopes(x)
-    off = cycles.off(np.stack(with_left_out(best), axis=1))
+    residuals = cycles.residuals(np.stack(with_left_out(best), axis=1))
     jacobian = problem.jacobian(x)
     plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
-    covariance = slopes @ _with_left_out(plain, jacobian, problem.weights.white(off)) @ slopes.T
+    covariance = (
+        slopes @ _with_left_out(plain, jacobian, problem.weights.white(residuals)) @ slopes.T
+    )
     prior = np.sqrt(np.diag(slopes @ slopes.T))
-    first_residual = off[: len(cycles.bins.count), 0]
+    first_residual = residuals[: len(cycles.bins.count), 0]
     rms = float(np.sqrt(np.average(first_residual**2, weights=cycles.bins.count)))
     parameter_covariance = slopes @ plain @ slopes.T
     return Fitted(best, space.free, covariance, parameter_covariance, prior, rms, space.scaled)

@@ -424,8 +424,8 @@ def _blow_off_ends(
         blow_offs += 1
         before = pressure[max(stretch.last - steady, stretch.first) : stretch.last]
         after = pressure[following.first : min(following.last, following.first + rows)]
-        off = np.abs(after - before.mean()) > CLEAR * noise
-        left = np.flatnonzero(off[1:] & off[:-1])  # a single row may be an outlier
+        differs = np.abs(after - before.mean()) > CLEAR * noise
+        left = np.flatnonzero(differs[1:] & differs[:-1])  # a single row may be an outlier
         if np.ptp(before) < 2.0 * CLEAR * noise and len(left):
             times.append(float(left[0]) * period)
     return _median(times) if len(times) > 0.5 * blow_offs else float("nan")

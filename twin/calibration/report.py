@@ -214,16 +214,16 @@ def _beyond(verdict: Verdict) -> str:
     return tr("the twin is off by more than its cycles differ: {weak}", weak=weak)
 
 
-def _weak(phase: Phase, off: Residual) -> str:
+def _weak(phase: Phase, residual: Residual) -> str:
     """The residual of a phase, its largest value, and the causes that it concerns."""
     values = {
-        "times": numeral(off.times, ".1f"),
+        "times": numeral(residual.times, ".1f"),
         "phase": spoken(phase.name.lower()),
-        "size": numeral(abs(off.most) / MBAR, ".1f"),
-        "time": numeral(off.at / MS, ".0f"),
+        "size": numeral(abs(residual.most) / MBAR, ".1f"),
+        "time": numeral(residual.at / MS, ".0f"),
         "causes": tr(WEAKENS[phase]),
     }
-    if off.most > 0.0:
+    if residual.most > 0.0:
         return tr(
             "{times} times in {phase}, at most {size} mbar measured above expected, {time} ms after"
             " it begins ({causes})",

@@ -36,9 +36,9 @@ class CycleWhitener:
 
     parts: Sequence[tuple[Ints, Covariance]]  # bins of a cycle, and their covariance
 
-    def white(self, off: Floats) -> list[Floats]:
+    def white(self, residuals: Floats) -> list[Floats]:
         """Whitened residuals (bins, n) of each cycle; bins without a cycle are left out."""
-        return [covariance.white(off[rows]) for rows, covariance in self.parts]
+        return [covariance.white(residuals[rows]) for rows, covariance in self.parts]
 
     def followed_by(self, other: "CycleWhitener", bins: int) -> "CycleWhitener":
         """These weights, for a pressure with ``bins``, then those of a second pressure."""
@@ -71,18 +71,18 @@ def weighted(cycles: Cycles, theta: Theta, noise: float, *, fitted: bool) -> Cyc
     more_volume, parameter = standing_for(c.VOLUME)
     volume_change = (more_volume.name, {parameter.name: VOLUME * theta[c.VOLUME] / ML})
     sigmas = [volume_change, *_scatter_changes(float(np.median(cycles.dt)))]
-    off, moves = sensitivities(
-        lambda at: cycles.off(coefficients_at(theta, sigmas, at)),
+    residuals, moves = sensitivities(
+        lambda at: cycles.residuals(coefficients_at(theta, sigmas, at)),
         np.zeros(len(sigmas)),
         np.ones(len(sigmas)),
     )
     always, scatter = np.column_stack([moves[:, :1], cycles.unsure]), moves[:, 1:]
-    errors, cycle_error = np.full(len(off), FIRST_ERROR), np.zeros(len(off))
+    errors, cycle_error = np.full(len(residuals), FIRST_ERROR), np.zeros(len(residuals))
     if fitted:
-        off = _without_sensor_error(off, cycles.unsure)
-        sizes, timely = _without_times(off, scatter[:, TIMES], bins, noise)
+        residuals = _without_sensor_error(residuals, cycles.unsure)
+        sizes, timely = _without_times(residuals, scatter[:, TIMES], bins, noise)
         scatter[:, TIMES] *= np.maximum(sizes, 1.0)
-        errors, cycle_error = _errors(off, timely, bins, noise)
+        errors, cycle_error = _errors(residuals, timely, bins, noise)
     errors = np.hypot(errors, LATE * _slope(cycles))
     parts, rows_by_cycle = [], _settled(bins)
     for rows in rows_by_cycle:
@@ -110,25 +110,27 @@ def _scatter_changes(period: float) -> list[tuple[str, dict[str, float]]]:
     ]
 
 
-def _without_times(off: Floats, late: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
+def _without_times(
+    residuals: Floats, late: Floats, bins: Bins, noise: float
+) -> tuple[Floats, Floats]:
     """How much times scatter (rms over cycles, in sigmas), and the residuals (Pa) without that.
 
     ``late`` are changes (Pa) by one sigma of each time, (bins, times): this is its prior.
     """
-    sizes, timely = [], off.copy()
+    sizes, timely = [], residuals.copy()
     for rows in _settled(bins):
         covariance = fading(np.full(len(rows), FIRST_ERROR), bins.time[rows], bins.stretch[rows])
         add_independent(covariance, noise**2 / bins.count[rows])
-        white = Covariance.of(covariance).white(np.column_stack([off[rows], late[rows]]))
+        white = Covariance.of(covariance).white(np.column_stack([residuals[rows], late[rows]]))
         information = white[:, 1:].T @ white[:, 1:] + np.eye(late.shape[1])
         sizes.append(np.linalg.solve(information, white[:, 1:].T @ white[:, 0]))
         timely[rows] -= late[rows] @ sizes[-1]
     return np.sqrt(np.mean(np.square(sizes), axis=0)), timely
 
 
-def _without_sensor_error(off: Floats, unsure: Floats) -> Floats:
+def _without_sensor_error(residuals: Floats, unsure: Floats) -> Floats:
     """Residuals (Pa) without the part that errors of the sensor explain."""
-    remainder: Floats = off - unsure @ np.linalg.lstsq(unsure, off)[0]
+    remainder: Floats = residuals - unsure @ np.linalg.lstsq(unsure, residuals)[0]
     return remainder
 
 
@@ -138,7 +140,7 @@ def _slope(cycles: Cycles) -> Floats:
     return cycles.bins.mean(np.gradient(pressure) / float(np.median(cycles.dt)))
 
 
-def _errors(off: Floats, timely: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
+def _errors(residuals: Floats, timely: Floats, bins: Bins, noise: float) -> tuple[Floats, Floats]:
     """The model's error in each bin (Pa): common to all cycles, and differing between them.
 
     Cycles that differ have a mean by chance: this is no common error. ``timely`` are the residuals
@@ -156,12 +158,12 @@ def _errors(off: Floats, timely: Floats, bins: Bins, noise: float) -> tuple[Floa
         mean = sums(residual) / counts
         return mean, _neighbour_mean(sums((residual - mean[number]) ** 2), kinds) / more
 
-    mean, variance = mean_and_variance(off[settled])
+    mean, variance = mean_and_variance(residuals[settled])
     _, timely_variance = mean_and_variance(timely[settled])
     noise_variance = _neighbour_mean(sums(noise**2 / bins.count[settled]) / counts, kinds)
     common = np.maximum(_neighbour_mean(mean**2 - variance / counts, kinds), LEAST_ERROR**2)
     alone = np.maximum(timely_variance - noise_variance, 0.0)
-    errors = np.zeros((2, len(off)))
+    errors = np.zeros((2, len(residuals)))
     errors[:, settled] = HIDDEN * np.sqrt(common)[number], np.sqrt(alone)[number]
     return errors[0], errors[1]
 

@@ -118,10 +118,12 @@ def _pressure_steps(cycles: Cycles, theta: Theta, noise: float) -> Iterator[Step
     typical = [(name, {p.name: p.typical}) for name, p in parameters]
     neutral = np.zeros(len(parameters))
     steps = inside(neutral, np.array([p.range(theta)[1] / p.typical for _, p in parameters]), 1.0)
-    off = np.column_stack(
-        sensitivities(lambda at: cycles.off(coefficients_at(theta, typical, at)), neutral, steps)
+    residuals = np.column_stack(
+        sensitivities(
+            lambda at: cycles.residuals(coefficients_at(theta, typical, at)), neutral, steps
+        )
     )
-    white = weighted(cycles, theta, noise, fitted=False).white(off)
+    white = weighted(cycles, theta, noise, fitted=False).white(residuals)
     for number, (name, parameter) in enumerate(parameters, 1):
         power = np.array([effect[:, number] @ effect[:, number] for effect in white])
         if power.min() < 1.0:  # a typical size would be no more than noise

@@ -67,15 +67,15 @@ class Verdict:
 
 def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     """Judge the twin of ``data`` on ``cycles``; ``noise`` (Pa) is that of one reading."""
-    _, off = cycles.best_early(coefficients(data))
+    _, bin_residuals = cycles.best_early(coefficients(data))
     bins = cycles.bins
     places = bins.place_by_turn
-    used = (bins.cycle >= 1) & np.isfinite(off)  # the model settles in the first cycle
+    used = (bins.cycle >= 1) & np.isfinite(bin_residuals)  # the model settles in the first cycle
     residuals = {}
     for phase in Phase:
         rows = used & (_phase_of(bins.kind) == phase)
         if rows.any():
-            residual, place_number = off[rows], places[rows]
+            residual, place_number = bin_residuals[rows], places[rows]
             rms, floor = _rms_and_floor(
                 residual, place_number, bins.cycle[rows], bins.count[rows], noise
             )
@@ -84,10 +84,10 @@ def judge(cycles: Cycles, data: DataSet, noise: float) -> Verdict:
     return Verdict(residuals)
 
 
-def _largest_mean(off: Floats, place: Ints, since: Floats) -> tuple[float, float]:
+def _largest_mean(residual: Floats, place: Ints, since: Floats) -> tuple[float, float]:
     """The largest mean residual (Pa) of bins that enough cycles have, and its time (s)."""
     _, number, counts = np.unique(place, return_inverse=True, return_counts=True)
-    mean = np.bincount(number, off) / counts
+    mean = np.bincount(number, residual) / counts
     worst = int(np.argmax(np.abs(mean) * (counts >= min(FEWEST, counts.max()))))
     return float(mean[worst]), float(np.median(since[number == worst]))
 
@@ -99,7 +99,7 @@ def _phase_of(kind: Ints) -> Ints:
 
 
 def _rms_and_floor(
-    off: Floats, place: Ints, cycle: Ints, count: Ints, noise: float
+    residual: Floats, place: Ints, cycle: Ints, count: Ints, noise: float
 ) -> tuple[float, float]:
     """Rms over rows (Pa) of the residual, and of the floor.
 
@@ -110,12 +110,12 @@ def _rms_and_floor(
     times the median from the mean gets less weight in both.
     """
     _, number, counts = np.unique(place, return_inverse=True, return_counts=True)
-    mean = np.bincount(number, off) / counts
-    deviation = (off - mean[number]) ** 2 * (counts / np.maximum(counts - 1, 1))[number]
+    mean = np.bincount(number, residual) / counts
+    deviation = (residual - mean[number]) ** 2 * (counts / np.maximum(counts - 1, 1))[number]
     is_common = (counts >= FEWEST)[number]
     within_bin = noise**2 * (1.0 - 1.0 / count)  # what averaging over a bin took away
     if not is_common.any():
-        return float(np.sqrt(np.average(off**2 + within_bin, weights=count))), noise
+        return float(np.sqrt(np.average(residual**2 + within_bin, weights=count))), noise
     _, cycle_number = np.unique(cycle, return_inverse=True)
     rows = np.bincount(cycle_number, count * is_common)
     cycle_variance = np.bincount(
@@ -124,7 +124,7 @@ def _rms_and_floor(
     median = np.median(cycle_variance[rows > 0])
     weight = np.minimum(1.0, ODD**2 * median / np.maximum(cycle_variance, median))
     mean_square = np.sum(
-        weight * np.bincount(cycle_number, count * is_common * (off**2 + within_bin))
+        weight * np.bincount(cycle_number, count * is_common * (residual**2 + within_bin))
     ) / np.sum(rows)
     floor = np.mean((weight * cycle_variance)[rows > 0])
     return float(np.sqrt(mean_square)), float(np.sqrt(floor))

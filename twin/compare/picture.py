@@ -24,7 +24,7 @@ def draw(comparison: Comparison) -> Picture:
         )
         for label, side in (("A", comparison.a), ("B", comparison.b)):
             _draw_vacuum(vacuum, label, side)
-            _band(deviation, side.off, COLOURS[label], f"{label}: measured − expected")
+            _band(deviation, side.deviation_curve, COLOURS[label], f"{label}: measured − expected")
         _draw_difference(difference, comparison)
         _name(vacuum, "vacuum (mbar)")
         _name(difference, "difference (mbar)")

@@ -33,7 +33,7 @@ def record(comparison: Comparison, path: Path) -> None:
         _send_curve(rr, stream, f"vacuum/{label}/measured", name, side.measured_vacuum)
         expected = f"{label.upper()}: expected"
         _send_curve(rr, stream, f"vacuum/{label}/expected", expected, side.expected_vacuum)
-        _send_curve(rr, stream, f"deviation/{label}", name, side.off)
+        _send_curve(rr, stream, f"deviation/{label}", name, side.deviation_curve)
     for kind in ("measured", "expected"):
         time, mean, _ = difference(*(getattr(side, f"{kind}_vacuum") for side in (a, b)))
         _send(rr, stream, f"difference/{kind}", f"B − A, {kind} vacuum", (time, mean))

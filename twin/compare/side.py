@@ -96,7 +96,7 @@ class Side:
     curve: list[dict[str, float]] = field(default_factory=list)  # read off it, without a model
     measured_vacuum: Curve = field(default_factory=Curve)
     expected_vacuum: Curve = field(default_factory=Curve)
-    off: Curve = field(default_factory=Curve)  # measured less expected pressure
+    deviation_curve: Curve = field(default_factory=Curve)  # measured less expected pressure
 
     @property
     def asset(self) -> str:
@@ -120,7 +120,7 @@ class Side:
         pressure = np.where(usable, cycle.samples["pressure"], np.nan).astype(np.float64)
         self.measured_vacuum.add(since, (ambient - pressure) / MBAR)
         self.expected_vacuum.add(since, (ambient - cycle.ticks["expected"]) / MBAR)
-        self.off.add(since, deviation(cycle.samples, cycle.ticks) / MBAR)
+        self.deviation_curve.add(since, deviation(cycle.samples, cycle.ticks) / MBAR)
 
 
 class Recording(Protocol):

@@ -40,10 +40,10 @@ class Program:
         Gaps become median steps, and so do steps between cycles that were not consecutive.
         """
         steps = elapsed(samples)
-        usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else MS
-        is_gap = (steps <= 0.0) | (steps > LONGEST_STEP * usual)
-        steps[is_gap] = usual
-        finer = max(round(usual / MS), 1)
+        typical_step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else MS
+        is_gap = (steps <= 0.0) | (steps > LONGEST_STEP * typical_step)
+        steps[is_gap] = typical_step
+        finer = max(round(typical_step / MS), 1)
         rows = np.repeat(steps / finer, finer)
         return cls(rows, np.repeat(samples["commands"], finer), np.asarray(starts) * finer)
 

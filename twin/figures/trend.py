@@ -192,8 +192,8 @@ def _lacking(has_value: npt.NDArray[np.bool_]) -> int:
         return 0
     lacking = len(has_value) - 1 - int(rows[-1])
     between = np.diff(rows) - 1
-    usual = int(np.quantile(between, SURE, method="lower")) if len(between) else 0
-    return lacking if lacking >= ENDED and lacking > usual else 0
+    longest_typical = int(np.quantile(between, SURE, method="lower")) if len(between) else 0
+    return lacking if lacking >= ENDED and lacking > longest_typical else 0
 
 
 def line_through(host_ns: npt.NDArray[np.int64], values: Floats) -> Line | None:
@@ -262,7 +262,9 @@ def _step(host_ns: npt.NDArray[np.int64], values: Floats, least_sigmas: float) -
     line_residuals = medians - slope * times
     line_residuals = line_residuals - np.median(line_residuals)
     least = 1e-9 * float(np.abs(medians).max()) + 1e-300
-    misfit, line_misfit = (float(np.abs(off).sum()) + least for off in (residuals, line_residuals))
+    misfit, line_misfit = (
+        float(np.abs(values).sum()) + least for values in (residuals, line_residuals)
+    )
     # Schwarz's criterion for both: a step has one more parameter, its time.
     better = count * math.log(line_misfit / misfit) - 0.5 * math.log(count)
     if better < math.log(SURE / (1.0 - SURE)):

@@ -43,7 +43,7 @@ class Row:
     standing: Standing | None
     verdict: str  # of the newest diagnosis; empty without one
     causes: tuple[Mapping[str, Any], ...]
-    leftover: float  # mbar rms of the twin's error in the newest diagnosis; 0 without one
+    residual_rms: float  # mbar rms of the twin's error in the newest diagnosis; 0 without one
 
     @property
     def stands_out(self) -> bool:
@@ -206,7 +206,7 @@ def _sort_key(row: Row) -> tuple[float, ...]:
     beyond = row.standing.beyond if row.standing else 0.0
     drift_sigmas = max((drift.sigmas for drift in row.drifts), default=0.0)
     rank = (State.DOES_NOT, State.NOT_JUDGED, State.STANDS_OUT).index(row.state)
-    return float(rank), max(beyond, drift_sigmas), DIAGNOSED.get(row.verdict, 0), row.leftover
+    return float(rank), max(beyond, drift_sigmas), DIAGNOSED.get(row.verdict, 0), row.residual_rms
 
 
 def _plain(rank: int, row: Row) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def _limit(
 ) -> dict[str, Any]:
     own = [change for change in newest_first if change.limit == limit.key]
     applied = next((change for change in own if change.is_applied), None)
-    value, usual = in_force.value(limit.key), configured.value(limit.key)
+    value, configured_value = in_force.value(limit.key), configured.value(limit.key)
     return {
         "key": limit.key,
         "title": tr(limit.title),
@@ -44,7 +44,7 @@ def _limit(
         "highest": limit.highest,
         "value": value,
         "value_words": with_unit(value, limit.unit),
-        "configured_words": with_unit(usual, limit.unit),
+        "configured_words": with_unit(configured_value, limit.unit),
         "range_words": tr(
             "{a} to {b}",
             a=with_unit(limit.lowest, limit.unit),
