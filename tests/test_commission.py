@@ -27,6 +27,7 @@ from twin.calibration.commission import (
     ELSEWHERE,
     Commissioned,
     another_ambient,
+    by_fit,
     commission,
     free_of,
     guessed,
@@ -804,6 +805,34 @@ def test_a_sensor_at_another_place_than_told_is_said_where_the_fit_is_sure() -> 
         remarks = list(misplaced(told, replace(fitted, covariance=covariance)))
         assert [remark.line.endswith("before the tubes") for remark in remarks] == [True] * said
     assert not list(misplaced(fitted.data, fitted))
+
+
+def test_a_sensor_is_not_called_misplaced_where_a_fit_follows_as_well_with_it_as_configured() -> (
+    None
+):
+    fitted = commissioned().calibration.fitted
+    good, usable, refused = (
+        Verdict({Phase.SUCTION: Residual(left, 100.0)}) for left in (100.0, 180.0, 300.0)
+    )
+    number = [free.key for free in fitted.free].index("sensor_shift")
+    system = fitted.data.system
+    near, told = (
+        fitted.data.model_copy(update={"system": system.model_copy(update={"sensor_shift": shift})})
+        for shift in (-1.0, 1.0)
+    )
+    covariance = fitted.covariance.copy()
+    covariance[number, number] = 1e-6
+    fitted = replace(fitted, data=near, covariance=covariance)
+    fitted_from = []
+
+    def judged_from(start: DataSet) -> Verdict:
+        fitted_from.append(sensor_place(start))
+        return usable if len(fitted_from) == 1 else good
+
+    contradicted, undecided = (by_fit(told, fitted, good, judged_from) for _ in range(2))
+    assert len(contradicted) == len(undecided) + 1
+    assert fitted_from == pytest.approx([sensor_place(told)] * 2)
+    assert not by_fit(told, fitted, refused, judged_from)
 
 
 def test_a_verdict_says_where_most_is_left() -> None:

@@ -76,6 +76,7 @@ SAGS = {"droop_bar": 0.1, "lag_ms": 50.0}  # first guess of the supply
 CLEARLY = 15.0  # mbar: a threshold is reported if it differs by more
 # A sensor is reported as misplaced beyond this share of the line, and beyond so many sigmas.
 ELSEWHERE, SURELY = 0.6, 4.0
+KNOWN_PLACE = 1e-3  # of the line, one sigma of the sensor's place where it is taken as configured
 # A record that rises so far above ambient (mbar) has met a relief valve, which opens at about half
 # of that.
 RELIEVED, RELIEVES = 60.0, 0.5
@@ -218,9 +219,16 @@ def commission(
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
     fitted, remarks = _deciding(fitted, found_cycles, metered, readings)
-    remarks = [*by_gauge, *by_flow, *remarks]
-    if verdict.word != "refused":  # the places of a bad fit mean nothing
-        remarks += [*misplaced(config.data, fitted), *another_ambient(config.data, fitted)]
+    known = with_known_place(free)
+    of_fit = by_fit(
+        config.data,
+        fitted,
+        verdict,
+        lambda start: _judged(
+            samples, readings.noise, _fit(used, [start], known, progress), progress
+        )[-1],
+    )
+    remarks = [*by_gauge, *by_flow, *remarks, *of_fit]
     cycles = complete(fitted.data, samples)
     sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     healthy = _healthy(replace(config, data=fitted.data), fitted, cycles, samples, sigma)
@@ -326,18 +334,21 @@ def _best(
 
     If that is not good, it is the better one of this and of another from other tubes.
     """
-
-    def judged(fitted: Fitted) -> tuple[Fitted, Cycles, Verdict]:
-        progress("judging the fit")
-        cycles = Cycles.found(samples, fitted.data)
-        return fitted, cycles, judge(cycles, fitted.data, noise)
-
-    best = judged(fits(guesses))
+    best = _judged(samples, noise, fits(guesses), progress)
     if best[-1].word == "good":
         return best
     progress("more is left than the cycles differ: trying wider and narrower tubes")
-    other = judged(fits(other_tubes(guesses, best[0].data)))
+    other = _judged(samples, noise, fits(other_tubes(guesses, best[0].data)), progress)
     return min(best, other, key=lambda result: result[-1].worst)
+
+
+def _judged(
+    samples: Samples, noise: float, fitted: Fitted, progress: Callable[[str], None]
+) -> tuple[Fitted, Cycles, Verdict]:
+    """A fit, the cycles as it sees them, and how well it follows them."""
+    progress("judging the fit")
+    cycles = Cycles.found(samples, fitted.data)
+    return fitted, cycles, judge(cycles, fitted.data, noise)
 
 
 def other_tubes(guesses: Sequence[DataSet], best: DataSet) -> list[DataSet]:
@@ -642,6 +653,46 @@ def another_ambient(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
             f" says {was:g}"
         )
         yield Remark(text, f"[data.ambient] pressure_mbar = {now:.0f}")
+
+
+def at_place(data: DataSet, place: float) -> DataSet:
+    """``data`` with the sensor at a place along the line, 0 at the port and 1 at the vessel."""
+    shift = data.system.sensor_shift + place - sensor_place(data)
+    return data.model_copy(
+        update={"system": data.system.model_copy(update={"sensor_shift": shift})}
+    )
+
+
+def with_known_place(free: Sequence[Free]) -> tuple[Free, ...]:
+    """``free`` with the sensor's place as it is in the guess."""
+    return tuple(
+        replace(parameter, market=KNOWN_PLACE) if parameter.key == "sensor_shift" else parameter
+        for parameter in free
+    )
+
+
+def by_fit(
+    configured: DataSet,
+    fitted: Fitted,
+    verdict: Verdict,
+    judged_from: Callable[[DataSet], Verdict],
+) -> list[Remark]:
+    """Remarks on ambient pressure and on the sensor's place; those of a bad fit mean nothing.
+
+    ``judged_from`` fits and judges from a start at which the sensor stays. If that gets the same
+    verdict where the configuration has the sensor, the place is no contradiction: a short tube has
+    nearly the same pressure at both ends, and a fit goes to either.
+    """
+    if verdict.word == "refused":
+        return []
+    remarks, elsewhere = (
+        list(another_ambient(configured, fitted)),
+        list(misplaced(configured, fitted)),
+    )
+    if elsewhere:
+        as_configured = judged_from(at_place(fitted.data, sensor_place(configured)))
+        remarks += elsewhere if as_configured.word != verdict.word else []
+    return remarks
 
 
 def misplaced(configured: DataSet, fitted: Fitted) -> Iterator[Remark]:
