@@ -60,6 +60,18 @@ def proposal(folder: Path, **changes: object) -> Path:
 # --- what it is -----------------------------------------------------------------------------------
 
 
+def test_its_values_are_as_sure_as_those_of_its_mechanism() -> None:
+    mechanism = MECHANISMS["supply_pulsed"]
+    ranges = {
+        p.name: {"low": p.low, "high": p.high, "found": p.low} for p in mechanism.effect.parameters
+    }
+    ranges["drop"] |= {"low": 0.0, "found": 0.7}
+    effect = known(mechanism=mechanism.name, parameters=ranges).effect("second_ejector")
+    for taken, own in zip(effect.parameters, mechanism.effect.parameters, strict=True):
+        assert taken.relative_error == own.relative_error
+        assert taken.is_of_the_log == own.is_of_the_log
+
+
 def test_without_a_size_it_changes_nothing_and_with_one_it_is_its_mechanism() -> None:
     (effect,) = effects_in({"lifting_lip": known()})
     theta = coefficients(rigs.config("gripper").data)

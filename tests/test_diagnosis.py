@@ -850,7 +850,7 @@ def test_weather_that_nobody_measured_is_no_answer_where_more_is_left() -> None:
     assert not answer_module._is_doubtful(measured, (weather,), [0.6])
 
 
-def test_only_a_small_waveform_corrects_another() -> None:
+def test_a_small_waveform_or_none_shows_nothing_unlisted() -> None:
     evidence = collect(GRIPPER, [recorded(GRIPPER_PLC, 4, 32)])
     causes = (
         Cause("leakage", {"sonic_flow": 3.0}),
@@ -859,7 +859,10 @@ def test_only_a_small_waveform_corrects_another() -> None:
     )
     weights = covariance(evidence, causes).of(evidence.judged)
     beside = Unmodelled(evidence, weights, causes)
-    assert [beside.corrects_waveform(number) for number in range(3)] == [False, True, False]
+    assert [beside.can_show(number) for number in range(3)] == [True, False, False]
+    irregular = tuple(replace(cause, course=Course.INTERMITTENT) for cause in causes)
+    beside = Unmodelled(evidence, weights, irregular)
+    assert beside.can_show(2)  # it comes and goes, as others do
 
 
 @pytest.mark.slow

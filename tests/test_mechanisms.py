@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -465,6 +466,27 @@ def test_a_mechanism_that_hardly_varies_is_the_listed_cause_that_acts_there(
     evidence = cycling()
     named = tuple(Cause(cause, {}) for cause in causes)
     assert mechanisms._is_listed(evidence, evidence.judged, (mechanism,), named) is listed
+
+
+@pytest.mark.parametrize(("mechanism", "stands"), [(STEADY_LINE, False), (LIP, True)])
+def test_what_mends_the_law_of_a_cause_does_not_stand_beside_it(
+    mechanism: Cause, stands: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evidence, causes = cycling(), (Cause("filter_clogging", {"pressure_drop_at_nominal": 80.0}),)
+    ranked = [SimpleNamespace(hypothesis=(*causes, mechanism))]
+    monkeypatch.setattr(mechanisms, "explain_alone", lambda *_: None)
+    monkeypatch.setattr(mechanisms, "_best", lambda *_: ranked)
+    monkeypatch.setattr(mechanisms, "_explained", lambda *_: "stands")
+    explained = mechanisms.explain(evidence, evidence.judged, causes, lambda _: None)
+    assert explained == ("stands" if stands else None)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "left"),
+    [(5.0, 1.0, 0.0), (5.0, 3.0, 0.5), (5.0, 0.5, -0.125), (0.9, 0.8, 0.0), (0.9, 1.1, 1.0)],
+)
+def test_what_is_left_counts_beyond_what_is_usual(before: float, after: float, left: float) -> None:
+    assert mechanisms._left_in_mbar(before, after, 1.0) == pytest.approx(left)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from tools import battery_first
 from twin.diagnosis.answer import diagnose
 from twin.inference import unmodelled
 from twin.inference.priors import tempered
-from twin.inference.unmodelled import LEAST_SURE, MOST_BESIDE, SHARES, Odds
+from twin.inference.unmodelled import BESIDE, LEAST_SURE, MOST_BESIDE, SHARES, Odds
 from twin.model.effects import EFFECTS
 from twin.monitor.bins import Floats
 
@@ -70,6 +70,8 @@ def test_a_cause_is_no_surer_than_one_beside_something_that_surely_acts(
     assert least == pytest.approx(max(strange, 1.0 - MOST_BESIDE))
     if strange > 1.0 - MOST_BESIDE:
         assert beside == pytest.approx(usual)
+    look_alikes = beside * rivals / (1.0 + BESIDE * ratio)
+    assert beside + look_alikes + least == pytest.approx(1.0)
     assert Odds(0.1).of_cause(1, 0.0, is_beside=True) == pytest.approx(MOST_BESIDE)
 
 

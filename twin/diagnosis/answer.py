@@ -142,7 +142,7 @@ def diagnose(
     if like_weather:  # what the model has wrong of such weather is smooth, and recurs as well
         probability_alone = min(probability_alone, LIKELY)
     likely = probability_alone > LIKELY or any(
-        not beside.corrects_waveform(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
+        beside.can_show(number) and cause_odds.of_unlisted(len(hypothesis)) > LIKELY
         for number, cause_odds in enumerate(odds)
     )
     strange = look(

@@ -95,7 +95,10 @@ def explain(
     names = [cause.effect for cause in causes]
     if by_itself or not causes or not has_room(evidence.theta, names, more=1):
         return by_itself
-    return _explained(evidence, fitted, causes, _best(evidence, fitted, causes, progress))
+    ranked = _best(evidence, fitted, causes, progress)
+    if _is_listed(evidence, fitted, ranked[0].hypothesis, causes):
+        return None  # it mends the law of the cause beside which it stands
+    return _explained(evidence, fitted, causes, ranked)
 
 
 def explain_alone(
@@ -162,7 +165,7 @@ def _displaces(
     before, after = _squares(evidence, weights, causes, mechanism)
     most = HALF * before
     if before > weights.usual**2:
-        if _left_in_mbar(evidence, weights, causes, mechanism) < DISPLACES:
+        if _left_in_mbar(before, after, weights.usual**2) < DISPLACES:
             return True
         most = before if len(causes) > 1 else 0.0
     return after < most and _unlikely(evidence, fitted, mechanism) + LIKELIER < _unlikely(
@@ -337,8 +340,10 @@ def _explained(
     (best,) = fit(evidence, weights, [best.hypothesis])
     before = float(np.sum(white(evidence, weights, [causes]) ** 2))
     share_left = (best.chi2 - best.count) / max(before - best.count, 1.0)
-    left_in_mbar = _left_in_mbar(evidence, weights, causes, best.hypothesis)
-    most_left = HALF if min(share_left, left_in_mbar) < NEARLY_ALL else MOST_LEFT
+    in_mbar, usual = _squares(evidence, weights, causes, best.hypothesis), weights.usual**2
+    left_in_mbar = _left_in_mbar(*in_mbar, usual)
+    nearly_all = share_left < NEARLY_ALL or (in_mbar[0] > usual and left_in_mbar < NEARLY_ALL)
+    most_left = HALF if nearly_all else MOST_LEFT
     if max(share_left, left_in_mbar) > most_left:
         return None
     rivals = tuple(
@@ -365,18 +370,14 @@ def _not_told_from(
             yield candidate
 
 
-def _left_in_mbar(
-    evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis, hypothesis: Hypothesis
-) -> float:
-    """Mean square deviation of a hypothesis over that of causes, both less that of healthy cycles.
+def _left_in_mbar(before: float, after: float, usual: float) -> float:
+    """Mean square deviation ``after`` over that ``before`` (mbar²), both less the ``usual`` one.
 
-    If the residual of the causes is healthy, the ratio is undefined, since steep edges dominate it:
-    then 0 if the hypothesis leaves less than they do, else 1.
+    If the residual before is no more than usual, the ratio is undefined, since steep edges dominate
+    it: then 0 if less is left after, else 1.
     """
-    before, after = _squares(evidence, weights, causes, hypothesis)
-    usual = weights.usual**2
     if before > usual:
-        return float((after - usual) / max(before - usual, 1e-9))
+        return (after - usual) / max(before - usual, 1e-9)
     return float(after >= before)
 
 

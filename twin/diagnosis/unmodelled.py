@@ -50,14 +50,22 @@ class Unmodelled:
             for over in OVER
         ]
 
-    def corrects_waveform(self, number: int) -> bool:
-        """Whether a cause explains less than the waveforms of all are off by, and not nothing.
+    def can_show(self, number: int) -> bool:
+        """Whether what is left where a cause acts can show something unlisted.
 
-        Such a cause may correct a waveform. So what suits its place is no evidence of something
-        unlisted. One that moves switching levels alone corrects none.
+        A cause that explains less than the waveforms of all are off by may correct a waveform. One
+        that moves switching levels alone has none, and shows something unlisted only if it is one
+        of several that come and go.
         """
         explained = np.sqrt(np.mean((self._off - self._off[:, :1]) ** 2, axis=0))
-        return bool(0.0 < explained[1 + number] <= MISMATCH * explained[-1])
+        if explained[1 + number] == 0.0:
+            return self._irregular > 1
+        return bool(explained[1 + number] > MISMATCH * explained[-1])
+
+    @property
+    def _irregular(self) -> int:
+        """Number of causes that come and go."""
+        return sum(cause.course == Course.INTERMITTENT for cause in self.found)
 
     def odds(self, number: int) -> Odds:
         """Odds for the cause of this number, among those found.
@@ -68,8 +76,8 @@ class Unmodelled:
         white = [self.weights.white(course * explained) for course in self._courses]
         cause = self.found[number]
         frequency = tempered(often(self.evidence, cause))
-        irregular = sum(found.course == Course.INTERMITTENT for found in self.found)
-        return Odds.of(self._log_likelihoods(white), effect_of(cause.effect), frequency, irregular)
+        of_cause = self._log_likelihoods(white), effect_of(cause.effect), frequency
+        return Odds.of(*of_cause, self._irregular)
 
     def alone(self) -> float:
         """Probability that something unlisted acts if no cause was found.

@@ -6,12 +6,13 @@ goes. The search for causes then tries them beside the table of effects.
 
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field, StringConstraints, model_validator
 
 from twin.errors import ConfigError, known_names
-from twin.model.effects import EFFECTS, UNKNOWN, Effect, Parameter, add_beside
+from twin.model.effects import EFFECTS, UNKNOWN, Effect, add_beside
 from twin.model.mechanism import MECHANISMS, Mechanism, free_slots
 from twin.model.theta import Theta
 from twin.settings import Settings
@@ -77,13 +78,10 @@ class CatalogueEffect(Settings):
         """It as an effect with a name; values beside its sizes start from those found."""
         sizes = {parameter.name for parameter in self.acts_as.place.parameters}
         parameters = tuple(
-            Parameter(
-                parameter.name,
-                parameter.unit,
-                bounds.low,
-                bounds.high,
-                parameter.typical,
-                ratio=parameter.ratio,
+            replace(
+                parameter,
+                low=bounds.low,
+                high=bounds.high,
                 usual=None if parameter.name in sizes else bounds.found,
             )
             for parameter in self.acts_as.effect.parameters
