@@ -9,6 +9,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -101,6 +102,26 @@ def test_who_asks_the_same_plc_has_the_same_line(server: ModbusServer) -> None:
     assert line_to(settings_for(server, unit=7), lines) is line
     assert line_to(settings_for(server, port=server.port % 60_000 + 1), lines) is not line
     assert line_to(settings_for(server, host="localhost"), lines) is not line
+
+
+def test_who_asks_at_the_same_time_has_what_was_made_once() -> None:
+    pool, ready = ConnectionPool(), threading.Barrier(4)
+    made: list[object] = []
+
+    def make() -> object:
+        time.sleep(0.05)  # the others ask meanwhile
+        made.append(object())
+        return made[-1]
+
+    def ask() -> object:
+        ready.wait()
+        return pool.shared(("acme", "there"), make)
+
+    with ThreadPoolExecutor(4) as threads:
+        shared = [asked.result() for asked in [threads.submit(ask) for _ in range(4)]]
+    assert shared == made * 4
+    assert len(made) == 1
+    assert pool.shared(("acme", "elsewhere"), make) is not made[0]
 
 
 def test_all_come_over_one_connection_and_each_gets_its_own_answer(server: ModbusServer) -> None:
