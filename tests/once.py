@@ -32,6 +32,13 @@ def alone(name: str) -> Iterator[Path | None]:
         yield path
 
 
+def _write_whole(path: Path, content: bytes) -> None:
+    """The file has all of it or is not there, even if the process ends while it writes."""
+    part = path.with_suffix(".part")
+    part.write_bytes(content)
+    part.rename(path)
+
+
 def once(function: Callable[P, R]) -> Callable[P, R]:
     """The function, whose results are for reading only; its arguments have a ``repr``."""
 
@@ -44,7 +51,7 @@ def once(function: Callable[P, R]) -> Callable[P, R]:
                 return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]
             found = function(*arguments, **named)
             if path:
-                path.write_bytes(pickle.dumps(found))
+                _write_whole(path, pickle.dumps(found))
             return found
 
     return result  # type: ignore[return-value]

@@ -22,3 +22,24 @@ def test_what_another_process_has_calculated_is_taken(
     here, there = once.once(doubled), once.once(doubled)  # as two processes have it
     assert [here(3), there(3), here(3), there(4)] == [6, 6, 6, 8]
     assert asked == calculated
+
+
+def test_a_result_that_was_written_in_part_is_calculated_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(once, "_folders", [])
+    once.share(tmp_path / "shared")
+
+    def a_half(path: Path, content: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(content[: len(content) // 2])
+        raise KeyboardInterrupt
+
+    def tripled(value: int) -> int:
+        return 3 * value
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", a_half)
+        with pytest.raises(KeyboardInterrupt):
+            once.once(tripled)(7)
+    assert once.once(tripled)(7) == 21
