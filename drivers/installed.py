@@ -6,20 +6,21 @@ a look-up reads the metadata of all installed packages.
 """
 
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import numpy as np
 
+from drivers.connection_pool import ConnectionPool
 from drivers.driver import AnyDriver, Driver
 from drivers.outputs.writer import Writer
 from drivers.probe import Line
 from drivers.reconnect import Away
 from drivers.settings import DriverSettings
 from twin.errors import ConfigError, SourceError, TwinError, in_words
-from twin.settings import Document
+from twin.settings import Document, Settings
 from twin.signals import SAMPLE, Samples
 
 GROUP = "ejector_twin.drivers"  # of entry points; packages of others name it
@@ -48,7 +49,7 @@ def load(kind: str) -> tuple[type[AnyDriver], str] | None:
     origin = f"the driver {kind!r} of {_package(found[0])}"
     try:
         loaded = found[0].load()
-    except Exception as error:  # whatever its modules do when they are imported
+    except (Exception, SystemExit) as error:  # whatever its modules do when they are imported
         raise ConfigError(
             f"{origin} cannot be imported from {found[0].value}: {in_words(error)}",
             "install what it needs beside ejector-twin, or ask its author",
@@ -73,6 +74,9 @@ def _misfit(loaded: object) -> str:
     settings = getattr(loaded, "settings_class", None)
     if not (isinstance(settings, type) and issubclass(settings, DriverSettings)):
         return "has no settings_class derived from drivers.settings.DriverSettings"
+    written = loaded.hil_settings_class
+    if written is not None and not (isinstance(written, type) and issubclass(written, Settings)):
+        return "has a hil_settings_class that is not derived from twin.settings.Settings"
     missing = sorted(loaded.__abstractmethods__)
     return f"lacks {' and '.join(missing)}" if missing else ""
 
@@ -80,15 +84,21 @@ def _misfit(loaded: object) -> str:
 class GuardedDriver(Driver[DriverSettings]):
     """An installed driver whose mistakes become SourceErrors that name it."""
 
-    def __init__(self, make: Callable[[], AnyDriver], origin: str) -> None:
-        with _named(origin):
-            self._driver = make()
+    def __init__(
+        self,
+        kind: type[AnyDriver],
+        settings: DriverSettings,
+        pool: ConnectionPool | None,
+        origin: str,
+    ) -> None:
+        super().__init__(settings, pool)
+        with naming(origin):
+            self._driver = kind(settings, pool)
         self._origin = origin
-        super().__init__(self._driver.settings, self._driver.pool)
 
     def blocks(self, away: Away | None = None, *, known: bool = False) -> Iterator[Samples]:
         """The driver's blocks; SourceError at a block that is none."""
-        with _named(self._origin):
+        with naming(self._origin):
             blocks = iter(self._driver.blocks(away, known=known))
             try:
                 for block in blocks:
@@ -103,13 +113,20 @@ class GuardedDriver(Driver[DriverSettings]):
                     blocks.close()
 
     def probe(self) -> list[Line]:
-        """What the driver's PLC answers."""
-        with _named(self._origin):
-            return list(self._driver.probe())
+        """What the driver's PLC answers; SourceError at a line that is none."""
+        with naming(self._origin):
+            lines = list(self._driver.probe())
+        for line in lines:
+            if not isinstance(line, Line):
+                raise SourceError(
+                    f"{self._origin} gave {type(line).__name__} instead of a line",
+                    f"probe gives a list of drivers.probe.Line; {A_MISTAKE}",
+                )
+        return lines
 
     def writer(self, document: Document) -> Writer:
         """The driver's writer."""
-        with _named(self._origin):
+        with naming(self._origin):
             return self._driver.writer(document)
 
 
@@ -123,15 +140,20 @@ def _no_block(block: object) -> str:
 
 
 @contextmanager
-def _named(origin: str) -> Iterator[None]:
-    """SourceError that names the driver for any error that is not for people."""
+def naming(origin: str, kind: type[TwinError] = SourceError) -> Iterator[None]:
+    """An error that names the driver, for any error that is not for people.
+
+    The mistake of a built-in driver, which has no ``origin``, stays as it is.
+    """
     try:
         yield
     except TwinError:
         raise
-    except Exception as error:  # whatever a driver of others raises
+    except (Exception, SystemExit) as error:  # whatever a driver of others raises
+        if not origin:
+            raise
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        raise SourceError(
+        raise kind(
             f"{origin} failed: {in_words(error)} ({Path(frame.filename).name}, line"
             f" {frame.lineno})",
             A_MISTAKE,

@@ -68,9 +68,9 @@ def driver_of(
 ) -> AnyDriver:
     """The driver that ``[driver]`` names, with its settings; errors as from ``settings_of``."""
     kind, origin = _find(document)
-    settings = _settings(document, kind, address)
+    settings = _settings(document, kind, origin, address)
     if origin:
-        return installed.GuardedDriver(lambda: kind(settings, pool), origin)
+        return installed.GuardedDriver(kind, settings, pool, origin)
     return kind(settings, pool)
 
 
@@ -79,27 +79,23 @@ def settings_of(document: Document, address: str = "") -> DriverSettings:
 
     ConfigError for an unknown kind, a driver that cannot be used, bad settings or a bad address.
     """
-    return _settings(document, driver_class(document), address)
+    return _settings(document, *_find(document), address)
 
 
 def hil_settings_of(document: Document) -> Settings:
-    """What ``[hil]`` lists; ConfigError as from ``driver_class``, or if the driver only reads."""
-    kind = driver_class(document)
+    """What ``[hil]`` lists; ConfigError as from ``settings_of``, or if the driver only reads."""
+    kind, origin = _find(document)
     if kind.hil_settings_class is None:
         raise cannot_write(document, document.tables["driver"]["kind"])
-    return document.section(kind.hil_settings_class, "hil")
-
-
-def driver_class(document: Document) -> type[AnyDriver]:
-    """The class of the driver that ``[driver]`` names; without such a table the default one.
-
-    ConfigError for an unknown kind, or if it cannot be used.
-    """
-    return _find(document)[0]
+    with installed.naming(origin, ConfigError):
+        return document.section(kind.hil_settings_class, "hil")
 
 
 def _find(document: Document) -> tuple[type[AnyDriver], str]:
-    """The class of the driver, and where it is from; "" if it is built in."""
+    """The class of the driver that ``[driver]`` names, and where it is from; "" if it is built in.
+
+    Without such a table the default one. ConfigError for an unknown kind, or if it cannot be used.
+    """
     table = document.tables.get("driver")
     kind = str(table.get("kind", DEFAULT)) if isinstance(table, dict) else DEFAULT
     if kind in BUILT_IN:
@@ -124,14 +120,27 @@ def _unknown(document: Document, kind: str) -> ConfigError:
     )
 
 
-def _settings(document: Document, kind: type[AnyDriver], address: str) -> DriverSettings:
+def _settings(
+    document: Document, kind: type[AnyDriver], origin: str, address: str
+) -> DriverSettings:
     if "driver" not in document.tables:
         raise ConfigError(f"{document.name}: there is no [driver] table", "say where the PLC is")
     folder = Path(document.name).parent  # files lie there, wherever the program was started
-    settings = document.section(kind.settings_class, "driver").below(folder)
-    if not address:
-        return settings
+    with installed.naming(origin, ConfigError):
+        settings = document.section(kind.settings_class, "driver").below(folder)
+        if address:
+            settings = settings.at(*_host_and_port(address))
+    if not isinstance(settings, DriverSettings):
+        raise ConfigError(
+            f"{origin} gave {type(settings).__name__} instead of settings",
+            f"settings_class.below and at return settings; {installed.A_MISTAKE}",
+        )
+    return settings
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    """The parts of HOST:PORT; ConfigError if it is not such a text."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= 0xFFFF:
         raise ConfigError(f"{address!r} is no address", "write it as HOST:PORT, e.g. 10.0.0.5:502")
-    return settings.at(host, int(port))
+    return host, int(port)

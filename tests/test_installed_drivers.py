@@ -24,7 +24,7 @@ from doc_examples import blocks
 from drivers import installed
 from drivers.sources import BUILT_IN, open_source, probe_source, settings_of
 from twin.cli.config import json_schema, mistakes
-from twin.errors import ConfigError, SourceError
+from twin.errors import ConfigError, SourceError, TwinError
 from twin.events import Kind
 from twin.log.reader import open_log
 from twin.quality import Quality
@@ -235,6 +235,40 @@ def test_one_that_cannot_be_used_says_why(
         open_source(table('kind = "acme"'))
     assert caught.value.hint
     assert any(str(caught.value) in mistake for mistake in mistakes(table('kind = "acme"')))
+
+
+INIT = "    def __init__(self, settings, pool=None):"
+WRONG = "    host: str = ''\n    def"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "address", "message"),
+    [
+        ("import numpy", "import sys; sys.exit()\nimport numpy", "", "imported .*: SystemExit"),
+        ("= Table\n", "= Table\n    hil_settings_class = 3\n", "", "has a hil_settings_class that"),
+        ("= Table\n", f"= Table\n{INIT}\n        pass\n", "", "failed: AttributeError: .*settings"),
+        ("= Table\n", f"= Table\n{INIT}\n        1 / 0\n", "", "failed: ZeroDiv.*line 14"),
+        ('    host: str = ""', f"{WRONG} below(self, folder): 1 / 0", "", "failed: Zero.*line 10"),
+        ('    host: str = ""', f"{WRONG} below(self, folder): pass", "", "NoneType instead of set"),
+        ('    host: str = ""', f"{WRONG} at(self, host, port): {{}}['x']", "a:1", "failed: KeyErr"),
+        ('[Line("connection", f"to', '[(f"to', "", "gave str instead of a line"),
+        ('[Line("connection", f"to', 'exit(1); [(f"to', "", "failed: SystemExit: 1"),
+    ],
+)
+def test_one_that_cannot_be_probed_is_named(
+    old: str, new: str, address: str, message: str, install: Install
+) -> None:
+    assert GOOD.count(old) == 1
+    install("acme", GOOD.replace(old, new))
+    whole = f"the driver 'acme' of acme-drivers 2.1 .*{message}"
+    with pytest.raises(TwinError, match=whole) as caught:
+        list(probe_source(table('kind = "acme"'), address))
+    assert caught.value.hint
+
+
+def test_a_mistake_in_its_settings_is_among_those_of_the_configuration(install: Install) -> None:
+    install("acme", GOOD.replace('host: str = ""', "def below(self, folder): 1 / 0"))
+    assert any("failed: ZeroDiv" in mistake for mistake in mistakes(table('kind = "acme"')))
 
 
 def test_two_packages_with_one_kind_are_named(install: Install) -> None:

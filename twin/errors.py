@@ -31,7 +31,7 @@ class SourceError(TwinError):
     exit_code = 3
 
 
-def in_words(error: Exception) -> str:
+def in_words(error: BaseException) -> str:
     """The text of an error; with its class, unless it is a TwinError."""
     return str(error) if isinstance(error, TwinError) else f"{type(error).__name__}: {error}"
 
