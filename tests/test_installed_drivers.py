@@ -342,3 +342,14 @@ def test_the_schema_takes_drivers_of_others() -> None:
     assert validator.is_valid({"driver": {"kind": "acme", "rack": 2}})
     assert not validator.is_valid({"driver": {"kind": "modbus", "rack": 2}})
     assert not validator.is_valid({"driver": {"rack": 2}})
+
+
+def test_the_schema_takes_what_drivers_of_others_write() -> None:
+    validator = jsonschema.Draft202012Validator(json_schema())
+    tables = tomllib.loads(rigs.path_of("gripper").read_text())
+    built_in = tables["driver"]
+    assert validator.is_valid({"driver": {"kind": "acme"}, "hil": {"db": 7}})
+    assert not validator.is_valid({"driver": {"kind": "acme"}, "hil": 7})
+    for other in ({"driver": built_in}, {"driver": built_in | {"kind": "modbus"}}, {}):
+        assert validator.is_valid(other | {"hil": {"min_interval_ms": 50, "tags": {}}})
+        assert not validator.is_valid(other | {"hil": {"tags": {}, "db": 7}})

@@ -181,7 +181,10 @@ def json_schema() -> dict[str, Any]:
     for name, by_kind in kinds.items():
         refs = [names[(kind, "validation")] for kind in by_kind.values()]
         tables[name] = refs[0] if len(refs) == 1 else {"anyOf": refs}
-    tables["driver"]["anyOf"].append(_other_than(kinds["driver"]))
+    other = _other_than(kinds["driver"])
+    tables["driver"]["anyOf"].append(other)
+    of_built_in = {"properties": {"hil": tables["hil"]}}
+    tables["hil"] = {"anyOf": [tables["hil"], {"type": "object"}]}  # what an editor offers
     reachable = _referenced(tables, definitions)
     return {
         "$schema": _SCHEMA,
@@ -189,6 +192,8 @@ def json_schema() -> dict[str, Any]:
         "type": "object",
         "properties": tables,
         "additionalProperties": False,
+        "if": {"properties": {"driver": other}, "required": ["driver"]},
+        "else": of_built_in,
         "$defs": {name: table for name, table in definitions.items() if name in reachable},
     }
 
