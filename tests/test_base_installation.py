@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from typing import NamedTuple
 
 import hatchling.build
 import numpy as np
@@ -287,33 +288,53 @@ HINTS = {
 }  # fmt: skip
 
 
-# Runs each command of a list as the program does; prints exit codes and what was complained of.
+# Runs each command of a list as the program does, in a copy of a process that has done no more than
+# to import it. Prints a line for each: exit code, complaint, and modules as the copy begins.
 EACH = """
-import io, json, sys
+import io, json, os, sys, traceback
 from contextlib import redirect_stderr, redirect_stdout
 from twin.cli.main import main
 
-answers = []
 for arguments in COMMANDS:
+    if os.fork():
+        os.wait()
+        continue
+    begun_with = len(sys.modules)
     sys.argv, said, code = ["twin", *arguments], io.StringIO(), 0
     with redirect_stderr(said), redirect_stdout(io.StringIO()):
         try:
             main()
         except SystemExit as end:
             code = end.code
-    answers.append([code, said.getvalue()])
-print(json.dumps(answers))
+        except Exception:
+            code = 1
+            traceback.print_exc()
+    print(json.dumps([code, said.getvalue(), begun_with]))
+    break
 """
 
 
+class Refusal(NamedTuple):
+    """The end of a command that lacks an extra."""
+
+    code: int
+    said: str
+    begun_with: int  # number of modules that are there before it begins
+
+
 @pytest.fixture(scope="module")
-def refused(base: Base, log: Path) -> dict[str, tuple[int, str]]:
-    """Exit code and complaint of each command of ``HINTS``, all run in one process."""
+def refused(base: Base, log: Path) -> dict[str, Refusal]:
+    """How each command of ``HINTS`` ends, none of which finds what another one imports."""
     paths = {"L": str(log), "C": str(GRIPPER), "U": str(OPC_UA)}
     hints = [hint for some in HINTS.values() for hint in some]
     commands = [[paths.get(word, word) for word in hint.split()] for hint in hints]
-    answers = json.loads(done(base(code=f"COMMANDS = {commands!r}\n{EACH}")))
-    return {hint: (code, said) for hint, (code, said) in zip(hints, answers, strict=True)}
+    lines = done(base(code=f"COMMANDS = {commands!r}\n{EACH}")).splitlines()
+    return {hint: Refusal(*json.loads(line)) for hint, line in zip(hints, lines, strict=True)}
+
+
+@pytest.mark.slow
+def test_each_command_without_its_extra_begins_anew(refused: dict[str, Refusal]) -> None:
+    assert len({end.begun_with for end in refused.values()}) == 1
 
 
 @pytest.mark.slow
@@ -321,10 +342,11 @@ def refused(base: Base, log: Path) -> dict[str, tuple[int, str]]:
     ("extra", "command"), [(extra, hint) for extra, some in HINTS.items() for hint in some]
 )
 def test_without_its_extra_a_command_says_what_to_install(
-    extra: str, command: str, refused: dict[str, tuple[int, str]]
+    extra: str, command: str, refused: dict[str, Refusal]
 ) -> None:
-    code, said = refused[command]
+    code, said, _ = refused[command]
     assert code == ConfigError.exit_code, said
+    assert said.count("\n") == 2, said
     first, second = said.splitlines()
     assert first.startswith("twin: ")
     assert f" needs the extra [{extra}]: " in first
