@@ -47,7 +47,8 @@ settings.load_profile("untimed")
 # The files that take longest, as measured in CI. They go first, so that no process is alone with
 # one at the end, and those that calculate beside those that wait for a PLC or a browser.
 FIRST = (
-    *("battery", "journeys", "diagnosis", "fault_run", "base_installation", "peers"),
+    *("battery", "journeys", "hidden_mechanisms", "diagnosis", "fault_run", "base_installation"),
+    *("hidden_mechanisms_second", "peers"),
     *("first_change", "page_browser", "mechanisms", "hil", "site", "another_day", "run_many"),
     *("unmodelled", "cli", "commission", "written_pages", "signal_checks", "page_past", "results"),
     *("healthy", "started_at_once", "measured_supply", "calibration", "page_all", "report", "aas"),
