@@ -1,9 +1,17 @@
 """The rate of false alarms: measured as it is, and judged against the one that is set."""
 
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from tools import false_alarms
 from tools.false_alarms import (
+    BEGIN,
+    END,
     PATH_OF,
     WITHIN,
     Device,
@@ -11,8 +19,10 @@ from tools.false_alarms import (
     is_as_set,
     of_limits,
     of_sums,
+    simulated,
     table,
 )
+from tools.fault_run import ROOT
 from tools.importance_sampling import BEGINS, Weighing, times_wanted
 from twin.alarms.rules import default_rules
 from twin.figures.settings import LIMITED
@@ -32,7 +42,43 @@ def rates(times: float) -> list[Rate]:
 )
 def test_too_few_false_alarms_are_not_the_rate_that_is_set(times: float, kept: bool) -> None:
     assert is_as_set(rates(times)) is kept
-    assert (": kept." in table(rates(times), 1000, 0)) is kept
+    assert (": kept." in table(rates(times), 8, 1000, 0)) is kept
+
+
+def test_the_page_has_the_table_as_it_is_written_today() -> None:
+    """Its words are the generator's, whatever the numbers and the result."""
+    page = (ROOT / "docs" / "isolation.md").read_text(encoding="utf-8")
+    block = page.split(BEGIN)[1].split(END)[0].strip()
+    rows = [row.split(" | ") for row in block.splitlines() if row.startswith("|")][2:]
+    named = [Rate(row[0][2:], 0.3, 1.0, 1.0, 1.0, row[4][:-2]) for row in rows]
+    assert numberless(block) == numberless(table(named, 8, 1000, 0))
+
+
+def numberless(text: str) -> str:
+    """A table without the name of its commit, its numbers and its result."""
+    nameless = re.sub(r"^\*\*[\w-]+, ", "", text)
+    return re.sub(r"[\d.,]+(e-?\d+)?|not (?=kept)|none", "", nameless)
+
+
+@pytest.mark.parametrize(
+    ("sources", "used"), [("d843178", True), ("d843178-dirty", False), ("unknown", False)]
+)
+def test_devices_of_sources_without_a_commit_are_simulated_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sources: str, used: bool
+) -> None:
+    normal, simulated_anew = np.zeros((2, 2)), list[int]()
+    device = Device(normal, np.eye(2), np.zeros(2), 1, normal, normal, 0)
+
+    def keep(seed: int, cycles: int, file: Path) -> None:
+        simulated_anew.append(seed)
+        np.savez_compressed(file, **asdict(device))
+
+    monkeypatch.setattr(false_alarms, "commit", lambda: sources)
+    monkeypatch.setattr(false_alarms, "_keep", keep)
+    monkeypatch.setattr(false_alarms, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
+    for _ in range(2):
+        assert len(simulated(range(3), 2, tmp_path, 1)) == 3
+    assert simulated_anew == ([0, 1, 2] if used else [0, 1, 2] * 2)
 
 
 def test_every_alarm_is_counted_or_no_judgement_of_cycles() -> None:

@@ -5,9 +5,13 @@ in a month of 3 s cycles is one in 0.9 million of them, and of single cycles one
 the tail is measured in two ways. Sums run at the real limit over cycles that are drawn from these
 by importance sampling. For single cycles and the limits of key figures a generalised Pareto
 distribution is fitted to the farthest tenth and extrapolated to the limit. Intervals are those of
-95 %, from devices or cycles drawn anew.
+95 %, from devices or cycles drawn anew. That of the total is the sum of their ends, and so wider.
 
-A simulated device is kept in a folder, so that a run that was stopped goes on where it was.
+Cycles are drawn independently and scores are standardised: what this leaves out, as a correlation
+of cycles far apart or an offset of one device, is not in the result.
+
+A simulated device is kept in a folder, so that a run that was stopped goes on where it was. Sources
+without a commit, or that differ from it, are simulated each time.
 
     nice -n 19 python -m tools.false_alarms [--devices 16] [--cycles 2500] [--workers 2]
         [--keep FOLDER] [--write docs/isolation.md]
@@ -15,7 +19,6 @@ A simulated device is kept in a folder, so that a run that was stopped goes on w
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields, replace
@@ -37,6 +40,7 @@ from twin.cli.setup import pair_of
 from twin.config import Config
 from twin.events import Kind
 from twin.figures.settings import LIMITED, Limits, limits_of
+from twin.files import private_folder, user_cache
 from twin.monitor.baseline import LEARNED, Baseline
 from twin.monitor.false_alarm_budget import (
     LIMITS,
@@ -66,7 +70,6 @@ FARTHEST = 0.1  # share of single cycles to which the tail is fitted
 RUNS = 1500  # runs to an alarm: the mean of so many is known to 2 %
 RESAMPLES = 100  # of cycles, for an interval of 95 %
 DRAWN_ANEW = 20  # times that devices are drawn anew for an interval of 95 %
-KEPT = Path(tempfile.gettempdir()) / "false_alarms"
 BEGIN = "<!-- false alarms: python -m tools.false_alarms --write docs/isolation.md -->"
 END = "<!-- end -->"
 # Which rate an alarm of the rules belongs to. Others are no judgement of healthy cycles' figures.
@@ -298,13 +301,17 @@ def is_as_set(rates: Sequence[Rate]) -> bool:
     return 1.0 / WITHIN <= total_of(rates) <= WITHIN
 
 
-def table(rates: Sequence[Rate], cycles: int, counted: int) -> str:
-    """The rates as a table for the page."""
+def table(rates: Sequence[Rate], devices: int, cycles: int, counted: int) -> str:
+    """The rates as a table for the page.
+
+    The ends of the intervals are summed for the total: they are those of a wider one than 95 %.
+    """
     low, high = (sum(rate.share * getattr(rate, end) for rate in rates) for end in ("low", "high"))
     lines = [
-        f"**{commit()}, {cycles:,} simulated healthy cycles of the gripper: {total_of(rates):.2f}"
-        f" times as many false alarms as are wanted (95 %: {low:.2g} to {high:.2g}), asked for"
-        f" {1.0 / WITHIN:.2f} to {WITHIN:g}: {'kept' if is_as_set(rates) else 'not kept'}.**",
+        f"**{commit()}, {cycles:,} healthy cycles of {devices} simulated grippers:"
+        f" {total_of(rates):.2f} times as many false alarms as are wanted (sums of the intervals'"
+        f" ends: {low:.2g} to {high:.2g}), asked for {1.0 / WITHIN:.2f} to {WITHIN:g}:"
+        f" {'kept' if is_as_set(rates) else 'not kept'}.**",
         "",
         "| what | of the budget | found over wanted | 95 % | from |",
         "| --- | --- | --- | --- | --- |",
@@ -322,10 +329,15 @@ def table(rates: Sequence[Rate], cycles: int, counted: int) -> str:
 
 
 def simulated(numbers: Sequence[int], cycles: int, folder: Path, workers: int) -> list[Device]:
-    """The devices of these seeds: kept ones, and the others simulated now and kept."""
+    """The devices of these seeds: kept ones, and the others simulated now and kept.
+
+    Only those of a commit are used again: other sources have no name, and may have changed.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    files = {seed: folder / f"{commit()}-{seed}-{cycles}.npz" for seed in numbers}
-    missing = [seed for seed, file in files.items() if not file.exists()]
+    sources = commit()
+    is_named = sources != "unknown" and not sources.endswith("-dirty")
+    files = {seed: folder / f"{sources}-{seed}-{cycles}.npz" for seed in numbers}
+    missing = [seed for seed, file in files.items() if not (is_named and file.exists())]
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         running = [pool.submit(_keep, seed, cycles, files[seed]) for seed in missing]
         for done, future in enumerate(as_completed(running), 1):
@@ -358,11 +370,14 @@ def main() -> int:
     parser.add_argument("--cycles", type=int, default=2200, help="of each device")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes that simulate")
-    parser.add_argument("--keep", type=Path, default=KEPT, help="folder of simulated devices")
+    parser.add_argument(
+        "--keep", type=Path, help="folder of simulated devices; by default in the user's own cache"
+    )
     parser.add_argument("--write", type=Path, help="the page with a place for the table")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.devices)
-    devices = simulated(seeds, arguments.cycles, arguments.keep, arguments.workers)
+    folder = arguments.keep or private_folder(user_cache() / "false_alarms")
+    devices = simulated(seeds, arguments.cycles, folder, arguments.workers)
     rates = [
         of_sums(devices, arguments.seed),
         of_single_cycles(devices, arguments.seed),
@@ -372,7 +387,7 @@ def main() -> int:
         sum(len(tested.scores) for tested in devices),
         sum(tested.counted for tested in devices),
     )
-    text_table = table(rates, cycles, counted)
+    text_table = table(rates, len(devices), cycles, counted)
     print(text_table)
     if arguments.write:
         text = arguments.write.read_text(encoding="utf-8")
