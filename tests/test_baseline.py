@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rigs
 
-from twin.figures.settings import SHORTEST_CYCLE_S, healthy_range
+from twin.figures.settings import SHORTEST_CYCLE_S, healthy_reach
 from twin.monitor.baseline import LEARNED, Baseline
 from twin.monitor.false_alarm_budget import (
     LIMITS,
@@ -104,10 +104,10 @@ def test_a_limit_of_a_key_figure_is_beyond_what_healthy_cycles_reach() -> None:
     for _ in range(units):
         seen = rng.normal(500.0, 8.0, 12)
         one = Scatter(mean=seen.mean(), sigma=seen.std(ddof=1) * sure(12), cycles=12)
-        low, high = healthy_range(Healthy(key_figures={"t1": one}), days)["t1"]
+        reach = healthy_reach(Healthy(key_figures={"t1": one}), days)["t1"]
         later = rng.normal(500.0, 8.0, 200)
-        beyond += int((later > high).sum())
-        assert low < seen.min()
+        beyond += int((later > one.mean + reach).sum())
+        assert one.mean - reach < seen.min()
     # One of five figures, one way: a fifth of the wanted rate.
     asked = units * 200 / wanted / 5
     assert asked / 1.5 < beyond < asked * 1.5

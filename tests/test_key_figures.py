@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tools.readme import filled
+from twin.figures import settings
 from twin.figures.cycle_view import (
     LAST_S,
     LEAK_WINDOW_S,
@@ -535,6 +536,77 @@ def test_limits_come_from_the_commissioned_unit_where_it_showed_the_figure() -> 
     assert set_here.t1 == 900.0
 
 
+def warned(limit: Limits, measured: float, expected: float, figure: str = "leakage") -> bool:
+    """Whether a cycle with this figure is warned of, where the model expects another one."""
+    unknown = dict.fromkeys(FIGURES, math.nan)
+    return bool(warnings(unknown | {figure: measured}, unknown | {figure: expected}, limit))
+
+
+def test_beyond_its_limit_the_expected_figure_does_not_hide_a_larger_one() -> None:
+    """The commissioned cycles leaked less than the model says: limits do not follow from it."""
+    tight = {"leakage": Seen(mean=4.0, sigma=0.01)}
+    found = limits(FigureSettings(), DATA, MonitorSettings(healthy=Healthy(key_figures=tight)))
+    assert found.leakage == 14.0
+    assert warned(found, measured=300.0, expected=15.0)
+    assert not warned(found, measured=24.0, expected=15.0)  # what the model expects, and 10 mbar/s
+    assert warned(found, measured=16.0, expected=13.0)
+    set_here = limits(FigureSettings(permitted_leakage_mbar_s=14.0), DATA, MonitorSettings())
+    assert warned(set_here, measured=15.0, expected=15.0)
+
+
+def test_where_cycles_scatter_the_expected_figure_has_that_scatter_about_it() -> None:
+    wide = {"leakage": Seen(mean=40.0, sigma=10.0)}
+    found = limits(FigureSettings(), DATA, MonitorSettings(healthy=Healthy(key_figures=wide)))
+    margin = found.leakage - 40.0
+    assert margin > 50.0
+    assert not warned(found, measured=199.0 + margin, expected=200.0)
+    assert warned(found, measured=201.0 + margin, expected=200.0)
+
+
+def test_each_side_of_the_supply_is_judged_for_itself() -> None:
+    """The expected supply is below the commissioned range: too high a one is still warned of."""
+    found = limits(FigureSettings(), DATA, commissioned(scatter=0.001))
+    unknown = dict.fromkeys(FIGURES, math.nan)
+    expected = unknown | dict.fromkeys(("lowest_supply", "highest_supply"), 3.0)
+
+    def at(bar: float) -> tuple[str, ...]:
+        supply = dict.fromkeys(("lowest_supply", "highest_supply"), bar)
+        return warnings(unknown | supply, expected, found)
+
+    assert found.supply == pytest.approx((3.375, 5.875))
+    assert at(3.0) == at(2.5) == ()
+    assert at(2.0) == at(6.5) == ("supply_out_of_range",)
+
+
+def test_a_supply_side_that_is_set_leaves_the_source_of_the_other() -> None:
+    found = limits(FigureSettings(supply_high_bar=6.0), DATA, commissioned(scatter=0.001))
+    high = {"lowest_supply": 4.0, "highest_supply": 7.0}
+    (words,) = in_words(["supply_out_of_range"], high, found)
+    assert words.endswith("bar, set in [figures])")
+    (words,) = in_words(["supply_out_of_range"], high | {"lowest_supply": 2.0}, found)
+    assert words.endswith("bar, from its commissioning)")
+
+
+def test_limits_that_are_known_need_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def noted(name: str) -> float:
+        asked.append(name)
+        return 100.0
+
+    monkeypatch.setattr(settings, "t1_from_rest", lambda _: noted("t1"))
+    monkeypatch.setattr(settings, "leakage_from_rest", lambda _: noted("leakage"))
+    limits(FigureSettings(), DATA, commissioned(scatter=0.001))
+    limits(
+        FigureSettings(permitted_t1_ms=900.0, permitted_leakage_mbar_s=90.0),
+        DATA,
+        MonitorSettings(),
+    )
+    assert asked == []
+    limits(FigureSettings(permitted_t1_ms=900.0), DATA, MonitorSettings())
+    assert asked == ["leakage"]
+
+
 def test_a_porous_part_has_a_limit_of_its_own() -> None:
     """It loses more in hold than any ejector permits, and is healthy."""
     parts = (DATA.system.parts[0], Vessel(kind="vessel", volume_ml=50.0))
@@ -565,6 +637,9 @@ def test_words_say_where_a_limit_comes_from() -> None:
     t1, leakage = in_words(["t1_over_limit", "leakage_over_limit"], over, set_here)
     assert t1 == "t1 over limit (9000 of 2000 ms, set in [figures])"
     assert leakage == "leakage over limit (400 of 250 mbar/s, from the unit's data set)"
+    seen = limits(FigureSettings(), DATA, commissioned(scatter=0.001))
+    (leakage,) = in_words(["leakage_over_limit"], over, seen)
+    assert leakage == "leakage over limit (400 of 75 mbar/s, from its commissioning)"
 
 
 def test_what_the_data_set_expects_is_warned_of_only_beyond_a_limit_that_is_set() -> None:

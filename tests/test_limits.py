@@ -60,6 +60,14 @@ def test_a_changed_limit_is_in_force_and_says_that_a_person_changed_it(
     assert after.configured().value("permitted_t1_ms") == configured.limits.t1
 
 
+def test_a_changed_side_of_the_supply_leaves_the_source_of_the_other(
+    configured: UnitLimits,
+) -> None:
+    after = configured.changed_to("supply_high_bar", 9.0).limits
+    assert after.source("highest_supply") == "changed by a person"
+    assert after.source("lowest_supply") == configured.limits.source("lowest_supply")
+
+
 def test_every_limit_can_be_changed_within_its_range(configured: UnitLimits) -> None:
     wanted = {"supply_low_bar": 1.0, "supply_high_bar": 9.0}
     for key, limit in ADJUSTABLE.items():

@@ -83,7 +83,7 @@ ADJUSTABLE = {
             0.1,
             16.0,
             lambda figures, _: figures.supply[1],
-            "lowest_supply",
+            "highest_supply",
         ),
         AdjustableLimit(
             "false_alarm_days",

@@ -91,6 +91,8 @@ _ALARMS = (  # evidence of alarms
     "{warning}; expected {value}",
     "set in [figures]",
     "from the unit's data set",
+    "from its commissioning",
+    "changed by a person",
 )
 _COMMISSIONING = (  # what a record corrects in the configuration, and the lines to write instead
     "the opened system stands at {measured} mbar; the configuration says {configured}",

@@ -1,8 +1,7 @@
 """The table ``[figures]``: permitted values, and where key figures are kept."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -17,9 +16,11 @@ from twin.monitor.monitor import MonitorSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
 LOWEST = "lowest_supply"  # the figure whose limit is a lower one
+HIGHEST = "highest_supply"
 # Least margin to the usual, in the figure's unit: less is not worth a warning. Chosen.
-LEAST = {"t1": 50.0, "leakage": 10.0, LOWEST: 0.5, "highest_supply": 0.5}
-LIMITED = ("t1", "leakage", "free_flow", LOWEST, "highest_supply")
+LEAST = {"t1": 50.0, "leakage": 10.0, "free_flow": 50.0, LOWEST: 0.5, HIGHEST: 0.5}
+LIMITED = ("t1", "leakage", "free_flow", LOWEST, HIGHEST)
+TOLERANCE = 0.25  # share of the usual by which a limit is beyond it, unless set. Chosen
 SHORTEST_CYCLE_S = 1.0  # cycle time for which false alarms are budgeted; longer ones give fewer
 
 
@@ -43,7 +44,7 @@ class FigureSettings(DatabaseSettings):
     currency: Annotated[str, Field(min_length=1, max_length=8)] = "€"  # symbol of the currency
     # Hours a year for yearly costs. Chosen: two shifts of 8 h on 250 days; a year has 8760.
     operating_hours: Annotated[float, Field(gt=0.0, le=8784.0)] = 4000.0
-    autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = 0.25  # over the last good cycles
+    autoset_tolerance: Annotated[float, Field(ge=0.0, le=10.0)] = TOLERANCE  # over what is usual
     keep: bool = False  # twin run adds its cycles to the database
     # Cycles older than this are deleted, and stay counted; by default all are kept.
     keep_days: Positive | None = None
@@ -62,11 +63,24 @@ class FigureSettings(DatabaseSettings):
         return self
 
 
+def permitted(usual: float, tolerance: float, least: float) -> float:
+    """The limit of a figure: ``usual`` plus a share of it, but at least ``least`` for scatter."""
+    return usual + max(tolerance * usual, least)
+
+
+def _limit_about(name: str, usual: float, tolerance: float, least: float) -> float:
+    """The limit of a figure that is usually ``usual``; that of the lowest supply is a lower one."""
+    upper = permitted(usual, tolerance, least)
+    return 2.0 * usual - upper if name == LOWEST else upper
+
+
 @dataclass(frozen=True)
 class Limits:
     """The permitted values of one unit, all known, in the figures' units.
 
-    ``configured`` names the figures whose limit is set, and does not follow from the data set.
+    ``configured`` names the figures whose limit is set, ``commissioned`` those whose limit comes
+    from the commissioned cycles. All others follow from the data set. ``margins`` are the least
+    distances of a limit from the usual, by figure: healthy cycles scatter by less.
     """
 
     t1: float  # ms; infinite if no suction of the data set reaches H1
@@ -74,32 +88,43 @@ class Limits:
     free_flow: float  # mbar
     supply: tuple[float, float]  # bar gauge
     configured: frozenset[str] = frozenset()
+    commissioned: frozenset[str] = frozenset()
     changed: frozenset[str] = frozenset()  # figures whose limit a person has changed
+    tolerance: float = TOLERANCE
+    margins: Mapping[str, float] = field(default_factory=lambda: dict(LEAST))
 
     def source(self, figure: str) -> str:
         """Where the limit of a figure comes from, for people."""
         if figure in self.changed:
             return "changed by a person"
-        return "set in [figures]" if figure in self.configured else "from the unit's data set"
+        if figure in self.configured:
+            return "set in [figures]"
+        return (
+            "from its commissioning" if figure in self.commissioned else "from the unit's data set"
+        )
 
+    def given(self, expected: Mapping[str, float]) -> "Limits":
+        """The limits in a cycle of which the model expects these figures.
 
-def permitted(usual: float, tolerance: float, least: float) -> float:
-    """The limit of a figure: ``usual`` plus a share of it, but at least ``least`` for scatter."""
-    return usual + max(tolerance * usual, least)
+        Where the model itself is beyond a limit that is not set, the limit is about its figure.
+        """
+        return replace(
+            self,
+            t1=self._given("t1", self.t1, expected),
+            leakage=self._given("leakage", self.leakage, expected),
+            free_flow=self._given("free_flow", self.free_flow, expected),
+            supply=(
+                self._given(LOWEST, self.supply[0], expected),
+                self._given(HIGHEST, self.supply[1], expected),
+            ),
+        )
 
-
-def healthy_range(healthy: Healthy, days: float) -> dict[str, tuple[float, float]]:
-    """Lowest and highest values of key figures in healthy cycles, from the commissioning.
-
-    Healthy cycles exceed them so seldom that ``days`` lie between all false alarms. Figures that
-    the commissioning did not see are left out.
-    """
-    cycles = cycles_between(days, LIMITS, SHORTEST_CYCLE_S)
-    ranges = {}
-    for name, figure in healthy.key_figures.items():
-        reach = figure.estimate * student_limit(cycles, len(LIMITED), figure.cycles)
-        ranges[name] = figure.mean - reach, figure.mean + reach
-    return ranges
+    def _given(self, name: str, limit: float, expected: Mapping[str, float]) -> float:
+        usual = expected[name]
+        is_beyond = usual < limit if name == LOWEST else usual > limit
+        if name in self.configured or not is_beyond:
+            return limit
+        return _limit_about(name, usual, self.tolerance, self.margins[name])
 
 
 def limits_of(config: Config) -> Limits:
@@ -113,59 +138,73 @@ def limits(settings: FigureSettings, data: DataSet, watch: MonitorSettings) -> L
 
     They keep such a distance that healthy cycles exceed them no more often than ``watch`` permits.
     """
-    reach = healthy_range(watch.healthy, watch.false_alarm_days)
-    own = _of_commissioning(watch.healthy, reach, settings.autoset_tolerance)
-    t1, leakage = settings.permitted_t1_ms, settings.permitted_leakage_mbar_s
-    free_flow = settings.permitted_free_flow_mbar
-    low, high = settings.supply_low_bar, settings.supply_high_bar
-    chosen = {
-        "t1": t1,
-        "leakage": leakage,
-        "free_flow": free_flow,
-        LOWEST: low if high is None else high,
+    tolerance = settings.autoset_tolerance
+    reach = healthy_reach(watch.healthy, watch.false_alarm_days)
+    margins = {name: max(least, reach.get(name, 0.0)) for name, least in LEAST.items()}
+    configured = _set_in(settings)
+    commissioned = {
+        name: _limit_about(name, watch.healthy.key_figures[name].mean, tolerance, margins[name])
+        for name in LEAST.keys() & reach.keys() - {"free_flow"}
     }
-    usual = _of_data_set(data, settings.autoset_tolerance)
-    if t1 is None:
-        t1 = own.get("t1", usual.t1)
-    if leakage is None:
-        leakage = own.get("leakage", usual.leakage)
-    if free_flow is None:
-        free_flow = max(usual.free_flow, *reach.get("free_flow", (-math.inf, -math.inf)))
-    if low is None:
-        low = own.get(LOWEST, usual.supply[0])
-    if high is None:
-        high = own.get("highest_supply", usual.supply[1])
-    configured = frozenset(name for name, value in chosen.items() if value is not None)
-    return Limits(t1, leakage, free_flow, (low, high), configured)
+    if "free_flow" in reach:  # far below H2, as a rule: then H2 limits it
+        highest = watch.healthy.key_figures["free_flow"].mean + reach["free_flow"]
+        if highest > _of_data_set("free_flow", data, tolerance):
+            commissioned["free_flow"] = highest
+    known = commissioned | configured
 
+    def limit(name: str) -> float:
+        return known[name] if name in known else _of_data_set(name, data, tolerance)
 
-def _of_commissioning(
-    healthy: Healthy, reach: Mapping[str, tuple[float, float]], tolerance: float
-) -> dict[str, float]:
-    """Limits of the key figures that the commissioning's cycles showed.
-
-    A limit is the mean of these cycles and the tolerance, or ``reach`` where healthy cycles scatter
-    more. That of the lowest supply is a lower one.
-    """
-    own = {}
-    for name in LEAST.keys() & reach.keys():
-        usual, (low, high) = healthy.key_figures[name].mean, reach[name]
-        beyond = permitted(usual, tolerance, LEAST[name])
-        own[name] = min(low, 2.0 * usual - beyond) if name == LOWEST else max(high, beyond)
-    return own
-
-
-def _of_data_set(data: DataSet, tolerance: float) -> Limits:
-    """Limits of a unit whose cycles nobody has seen: what its data set expects, and the tolerance.
-
-    Leakage may be at least what the ejector permits, and a free-flow vacuum is below H2.
-    """
-    ejector, nozzle_bar = data.ejector, data.supply.nozzle_bar
-    leakage = permitted(leakage_from_rest(data), tolerance, LEAST["leakage"])
-    highest = permitted(nozzle_bar, tolerance, LEAST[LOWEST])
     return Limits(
-        permitted(t1_from_rest(data), tolerance, LEAST["t1"]),
-        max(leakage, ejector.permitted_leakage_mbar_s),
-        ejector.h2_mbar - ejector.h2_hysteresis_mbar,
-        (2.0 * nozzle_bar - highest, highest),
+        limit("t1"),
+        limit("leakage"),
+        limit("free_flow"),
+        (limit(LOWEST), limit(HIGHEST)),
+        configured=frozenset(configured),
+        commissioned=frozenset(commissioned.keys() - configured.keys()),
+        tolerance=tolerance,
+        margins=margins,
     )
+
+
+def _set_in(settings: FigureSettings) -> dict[str, float]:
+    """The limits that are set, by figure."""
+    values = {
+        "t1": settings.permitted_t1_ms,
+        "leakage": settings.permitted_leakage_mbar_s,
+        "free_flow": settings.permitted_free_flow_mbar,
+        LOWEST: settings.supply_low_bar,
+        HIGHEST: settings.supply_high_bar,
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def healthy_reach(healthy: Healthy, days: float) -> dict[str, float]:
+    """How far healthy cycles come from the mean of the commissioning's, by limited figure.
+
+    They come farther so seldom that ``days`` lie between all false alarms. Figures that the
+    commissioning did not see are left out.
+    """
+    cycles = cycles_between(days, LIMITS, SHORTEST_CYCLE_S)
+    return {
+        name: figure.estimate * student_limit(cycles, len(LIMITED), figure.cycles)
+        for name, figure in healthy.key_figures.items()
+        if name in LIMITED
+    }
+
+
+def _of_data_set(name: str, data: DataSet, tolerance: float) -> float:
+    """The limit of a figure that no cycle showed: what the data set expects, and the tolerance.
+
+    Leakage may be at least what the ejector permits, and a free-flow vacuum is below H2. Those of
+    t1 and leakage simulate a suction, which takes time: only where they are needed.
+    """
+    ejector = data.ejector
+    if name == "free_flow":
+        return ejector.h2_mbar - ejector.h2_hysteresis_mbar
+    if name == "t1":
+        return permitted(t1_from_rest(data), tolerance, LEAST[name])
+    if name == "leakage":
+        leakage = permitted(leakage_from_rest(data), tolerance, LEAST[name])
+        return max(leakage, ejector.permitted_leakage_mbar_s)
+    return _limit_about(name, data.supply.nozzle_bar, tolerance, LEAST[name])

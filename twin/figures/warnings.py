@@ -6,7 +6,7 @@ So each is latched to the end of its cycle, and stands until the next cycle has 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from twin.figures.settings import Limits
+from twin.figures.settings import HIGHEST, LIMITED, LOWEST, Limits
 from twin.model.control import PROTECTED_SWITCHES
 
 Measured = Mapping[str, float]
@@ -79,23 +79,33 @@ CAUTIONS = {
 def warnings(measured: Measured, expected: Measured, limits: Limits) -> tuple[str, ...]:
     """The names of the warnings of a cycle, in the order of the table.
 
-    A warning that the expected cycle gives too is suppressed, unless the configuration sets its
-    limit: a program may end suction before H1, and a small tight volume switches often.
+    A warning that the expected cycle gives too is suppressed: a program may end suction before H1,
+    and a small tight volume switches often. Limits that the configuration does not set give way to
+    what is expected; a figure that is clearly beyond that as well is still warned of.
     """
+    given = limits.given(expected)
     return tuple(
         name
         for name, caution in CAUTIONS.items()
-        if caution.stands(measured, limits)
-        and (caution.figure in limits.configured or not caution.stands(expected, limits))
+        if caution.stands(measured, given)
+        and (caution.figure in LIMITED or not caution.stands(expected, given))
     )
 
 
 def in_words(names: Sequence[str], measured: Measured, limits: Limits) -> list[str]:
     """The same for people, with figure, limit, and where the limit comes from."""
     return [
-        caution.words.format(**measured, limits=limits, source=limits.source(caution.figure))
+        caution.words.format(
+            **measured, limits=limits, source=limits.source(_limited(caution, measured, limits))
+        )
         for caution in map(CAUTIONS.__getitem__, names)
     ]
+
+
+def _limited(caution: Caution, measured: Measured, limits: Limits) -> str:
+    """The figure whose limit is exceeded; of a supply that is beyond both, the lowest."""
+    is_upper_side = caution.figure == LOWEST and not measured[LOWEST] < limits.supply[0]
+    return HIGHEST if is_upper_side else caution.figure
 
 
 def table() -> str:
