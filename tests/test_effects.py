@@ -390,6 +390,8 @@ OTHER_MEANINGS = {
     # "leakage" is the key figure (mbar/s) of a cycle, with limits and warnings of its own.
     "alarms/limits.py": {"leakage"},
     "calibration/doubts.py": {"leakage"},
+    "diagnosis/extend.py": {"leakage"},
+    "figures/autoset.py": {"leakage"},
     "figures/cycle.py": {"leakage"},
     "figures/settings.py": {"leakage"},
     "figures/key_figures.py": {"leakage"},

@@ -14,13 +14,14 @@ from twin.assets.database import open_assets
 from twin.config import Config
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import Evidence, collect
-from twin.diagnosis.extend import extended, nothing, remarks, store
+from twin.diagnosis.extend import extended, nothing, remarks, shifted_key_figures, store
 from twin.errors import ConfigError
+from twin.figures.expected import leakage_from_rest
 from twin.live import Twin, run
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.model.courses import Cause, Course
-from twin.model.dataset import coefficients
+from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import EFFECTS
 from twin.model.term import Term
 from twin.model.theta import FILM
@@ -65,6 +66,40 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
         patch.chdir(folder)  # where the database is made
         assert twin(patch, "diagnose", one, "--save-as", "leaky") == 0
     return Saved(folder, "\n".join(said))
+
+
+# What healthy cycles are like with a finding.
+
+
+def test_key_figures_of_the_commissioning_move_with_what_was_found() -> None:
+    """A leak that is part of the data set now is no reason for a warning; the rest stays."""
+    before = rigs.config("test_rig").data
+    (size,) = EFFECTS["leakage"].parameters
+
+    def leaking(flow: float) -> DataSet:
+        effects = {**before.effects, "leakage": {size.name: flow}}
+        return DataSet.model_validate(before.model_dump() | {"effects": effects})
+
+    means = {"t1": 400.0, "leakage": 4.0, "highest_supply": 4.7, "supply": 4.6}
+    seen = {name: Scatter(mean=mean, sigma=0.1) for name, mean in means.items()}
+    after, doubted = leaking(2.0), coefficients(leaking(2.5))
+    shifted = shifted_key_figures(seen, before, after, [doubted])
+    found = leakage_from_rest(after) - leakage_from_rest(before)
+    assert found > 20.0
+    assert shifted["leakage"].mean == pytest.approx(4.0 + found)
+    uncertain = leakage_from_rest(leaking(2.5)) - leakage_from_rest(after)
+    assert shifted["leakage"].sigma == pytest.approx(np.hypot(0.1, uncertain))
+    assert shifted["t1"].mean > 400.0
+    assert all(shifted[name] == seen[name] for name in ("highest_supply", "supply"))
+    assert "leakage" not in shifted_key_figures(seen, before, leaking(50.0), [])
+
+
+def test_a_supply_that_was_found_low_is_what_its_gauge_reads() -> None:
+    before = rigs.config("test_rig").data
+    effects = {"supply_pressure_drop": {"drop": 0.5}}
+    seen = {"supply": Scatter(mean=4.6, sigma=0.1)}
+    shifted = shifted_key_figures(seen, before, before.model_copy(update={"effects": effects}), [])
+    assert shifted["supply"].mean == pytest.approx(4.1)
 
 
 # From log to log.
@@ -310,6 +345,23 @@ def test_a_level_that_is_never_reached_is_no_figure(evidence: Evidence) -> None:
     assert known is not None
     assert "h1_level" not in known.healthy.figures
     assert "suction_rms" in known.healthy.figures
+
+
+def test_key_figures_move_or_go_with_what_is_stored(evidence: Evidence) -> None:
+    """A gauge's mean stays with learned terms; the limited figures that they move do not."""
+    seen = {"leakage": Scatter(mean=4.0, sigma=0.1), "supply": Scatter(mean=4.6, sigma=0.1)}
+    healthy = evidence.healthy.model_copy(update={"key_figures": seen})
+    commissioned = replace(evidence, healthy=healthy)
+    config = rigs.config("test_rig")
+    leaky = extended(found(commissioned, Cause("leakage", {"sonic_flow": 2.0})), config)
+    assert leaky is not None
+    assert leaky.healthy.key_figures["leakage"].mean > 24.0
+    assert leaky.healthy.key_figures["leakage"].sigma > 0.5  # its size is known to 3 %
+    assert leaky.healthy.key_figures["supply"] == seen["supply"]
+    term = Term(where="suction", over="vacuum", at=(0.0, 700.0), mbar=(0.0, 9.0))
+    learned = extended(found(commissioned, verdict="unlisted", terms=(term,)), config)
+    assert learned is not None
+    assert learned.healthy.key_figures == {"supply": seen["supply"]}
 
 
 def test_terms_that_data_gave_are_in_it(evidence: Evidence) -> None:

@@ -17,20 +17,25 @@ from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
 from twin.diagnosis.text import spoken
 from twin.errors import ConfigError
+from twin.figures.expected import free_flow, leakage_from_rest, t1_from_rest
+from twin.figures.settings import HIGHEST, LIMITED, LOWEST
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives
 from twin.live import Twin
+from twin.model import theta as c
 from twin.model.catalogue import mechanism_of
 from twin.model.courses import Cause, Course
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import Parameter, apply, effect_of
 from twin.model.mechanism import MECHANISMS, RHYTHMIC
 from twin.model.term import AGAIN
+from twin.model.theta import Theta
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import figures, whole
 from twin.monitor.healthy import Healthy, Scatter
+from twin.monitor.measured_supply import SUPPLY
 from twin.monitor.scatter_covariance import SCATTER
-from twin.signals import Phase
+from twin.signals import BAR, Phase
 
 Sizes = Mapping[str, float]
 
@@ -55,6 +60,9 @@ def extended(diagnosis: Diagnosis, config: Config) -> Known | None:
     tables = data.model_dump() | {"terms": [*data.terms, *terms]}
     data = DataSet.model_validate(tables)
     healthy = _healthy(diagnosis, data)
+    doubted = [diagnosis.evidence.course(doubt)[0][1] for doubt in _doubts(diagnosis)]
+    shifted = shifted_key_figures(healthy.key_figures, config.data, data, doubted)
+    healthy = healthy.model_copy(update={"key_figures": shifted})
     return Known(data=data, healthy=_learned(diagnosis, data, healthy) if terms else healthy)
 
 
@@ -216,8 +224,50 @@ def _healthy(diagnosis: Diagnosis, data: DataSet) -> Healthy:
     return evidence.healthy.model_copy(update={"figures": by_name})
 
 
+def shifted_key_figures(
+    key_figures: Mapping[str, Scatter], before: DataSet, after: DataSet, doubted: Sequence[Theta]
+) -> dict[str, Scatter]:
+    """Key figures of healthy cycles, shifted by what an extended data set expects of them.
+
+    ``doubted`` are its coefficients with each uncertain size in turn moved by one sigma: sigmas are
+    wider by what that changes. A figure that one of the data sets does not expect is left out, so
+    that its limit follows from the extended one.
+    """
+    usual = _from_rest(before, coefficients(before))
+    moved = _from_rest(after, coefficients(after))
+    others = [_from_rest(after, theta) for theta in doubted]
+    shifted = {}
+    for name, scatter in key_figures.items():
+        shift = moved[name] - usual[name]
+        if math.isfinite(shift):
+            variance = sum(
+                (other[name] - moved[name]) ** 2 for other in others if math.isfinite(other[name])
+            )
+            mean = scatter.mean + shift
+            shifted[name] = _widened(scatter.model_copy(update={"mean": mean}), variance)
+    return shifted
+
+
+def _from_rest(data: DataSet, theta: Theta) -> dict[str, float]:
+    """Key figures that a data set expects with coefficients ``theta``, in their units.
+
+    One that cannot be measured is not finite.
+    """
+    t1 = t1_from_rest(data, theta)
+    nozzle_bar = float(theta[c.SUPPLY] - theta[c.DROOP]) / BAR
+    return {
+        "t1": t1,
+        "leakage": leakage_from_rest(data, theta) if math.isfinite(t1) else math.nan,
+        "free_flow": free_flow(theta),
+        **dict.fromkeys((LOWEST, HIGHEST, SUPPLY), nozzle_bar),
+    }
+
+
 def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
-    """Figures as in this log: learned terms do not predict their residuals."""
+    """Figures as in this log: learned terms do not predict their residuals.
+
+    Key figures with limits are left out, as nothing says how these terms move them from rest.
+    """
     cycles = whole(Twin.of(data).over([diagnosis.evidence.samples]))
     by_cycle = [figures(cycle, diagnosis.evidence.theta) for cycle in cycles if cycle.settled]
     learned = dict(healthy.figures)
@@ -227,7 +277,8 @@ def _learned(diagnosis: Diagnosis, data: DataSet, healthy: Healthy) -> Healthy:
             sigma = math.hypot(usual.sigma, float(np.std(values, ddof=1)))
             mean = float(np.mean(values))
             learned[name] = Scatter(mean=mean, sigma=sigma, cycles=len(values))
-    return healthy.model_copy(update={"figures": learned})
+    unlimited = {name: usual for name, usual in healthy.key_figures.items() if name not in LIMITED}
+    return healthy.model_copy(update={"figures": learned, "key_figures": unlimited})
 
 
 def _widened(usual: Scatter, variance: float) -> Scatter:

@@ -93,15 +93,7 @@ class Expectation:
     @cached_property
     def free_flow(self) -> float:
         """Vacuum (mbar) that suction reaches with all cups open; NaN if no cup can open."""
-        if not self._theta[[c.OPENING, c.HOLE]].any():
-            return float("nan")
-        opened = self._theta.copy()
-        opened[c.LAMINAR_LEAK] += opened[c.OPENING]
-        opened[c.LEAK] += opened[c.HOLE]
-        rows = round(FREE_S * 1e3)
-        commands = np.full(rows, Command.SUCTION, np.uint8)
-        _, expected = dense_solver.simulate(opened, np.full(rows, MS), commands)
-        return float(opened[c.AMBIENT] - expected[-1]) / MBAR
+        return free_flow(self._theta)
 
     def _run(
         self, model: DenseSolver, dt: Floats, samples: Samples, first: np.void | None
@@ -122,12 +114,26 @@ class Expectation:
         return pressure, phase
 
 
-def t1_from_rest(data: DataSet) -> float:
+def free_flow(theta: Theta) -> float:
+    """Vacuum (mbar) that suction reaches with all cups open; NaN if no cup can open."""
+    if not theta[[c.OPENING, c.HOLE]].any():
+        return float("nan")
+    opened = theta.copy()
+    opened[c.LAMINAR_LEAK] += opened[c.OPENING]
+    opened[c.LEAK] += opened[c.HOLE]
+    rows = round(FREE_S * 1e3)
+    commands = np.full(rows, Command.SUCTION, np.uint8)
+    _, expected = dense_solver.simulate(opened, np.full(rows, MS), commands)
+    return float(opened[c.AMBIENT] - expected[-1]) / MBAR
+
+
+def t1_from_rest(data: DataSet, theta: Theta | None = None) -> float:
     """Time (ms) from H2 to H1 that the data set expects; infinite if H1 is not reached.
 
-    The air saving is off, so that suction goes on to H1 of the data set.
+    The air saving is off, so that suction goes on to H1 of the data set. ``theta`` are other
+    coefficients than those of the data set.
     """
-    theta = coefficients(data)
+    theta = coefficients(data) if theta is None else theta.copy()
     theta[c.AIR_SAVING] = c.OFF
     seconds = 1.0
     while seconds <= LONGEST_SUCTION_S:
@@ -139,12 +145,15 @@ def t1_from_rest(data: DataSet) -> float:
     return math.inf
 
 
-def leakage_from_rest(data: DataSet) -> float:
-    """Leakage (mbar/s) that the data set expects of the first hold; 0 without a hold."""
-    reached_ms = t1_from_rest(data)
+def leakage_from_rest(data: DataSet, theta: Theta | None = None) -> float:
+    """Leakage (mbar/s) that the data set expects of the first hold; 0 without a hold.
+
+    ``theta`` are other coefficients than those of the data set.
+    """
+    reached_ms = t1_from_rest(data, theta)
     if not math.isfinite(reached_ms) or data.ejector.air_saving == "off":
         return 0.0
-    vacuum, phase = _suction(coefficients(data), LONGEST_SUCTION_S)
+    vacuum, phase = _suction(coefficients(data) if theta is None else theta, LONGEST_SUCTION_S)
     time = np.arange(len(vacuum), dtype=np.float64) * MS
     rows = Rows(time, vacuum, np.full(len(time), np.nan), phase, ended=True, blown=False)
     leakage = find_in_cycle(rows, data.ejector.h2_mbar, data.ejector.h1_mbar).vacuum.leakage
