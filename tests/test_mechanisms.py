@@ -29,21 +29,21 @@ from twin.diagnosis import answer as answer_module
 from twin.diagnosis import mechanisms
 from twin.diagnosis.another_log import judged_on
 from twin.diagnosis.answer import Diagnosis, diagnose
-from twin.diagnosis.evidence import HEALTHY, Evidence, collect
+from twin.diagnosis.evidence import HEALTHY, Evidence, collect, of_cycles
 from twin.diagnosis.extend import extended, nothing, remarks
 from twin.diagnosis.mechanism_picture import _elapsed, _least_squares, inferred
 from twin.diagnosis.mechanisms import Explained, acts_where, explain_alone
 from twin.diagnosis.pictures import Found
 from twin.diagnosis.propose import Proposal, _range, proposed
 from twin.diagnosis.report import _law_holds, draw, write_report
-from twin.diagnosis.residual_covariance import levels
+from twin.diagnosis.residual_covariance import _drift, levels
 from twin.diagnosis.text import lines
 from twin.errors import ConfigError
 from twin.languages.choice import language_of
 from twin.languages.texts import speaking
 from twin.live import Twin
 from twin.log.recorder import Recorder
-from twin.model import kernel
+from twin.model import dense_solver, kernel
 from twin.model import mechanism as m
 from twin.model import theta as c
 from twin.model.courses import Cause
@@ -163,6 +163,32 @@ def test_a_pulse_is_on_for_its_duty_from_its_shift_on() -> None:
     first = slice(90, 110)
     assert on[first].sum() == pytest.approx(110 - 100.4 - 1.0, abs=1.01)
     assert on[101:1101].mean() == pytest.approx(0.3, abs=1e-6)  # two periods
+
+
+@pytest.mark.parametrize("solver", ["kernel", "dense"])
+def test_what_time_alone_drives_goes_on_while_the_model_waits(solver: str) -> None:
+    """It waits for a first level, and after a gap. A break of time has no length."""
+    theta = apply(rigs.theta("test_rig"), "sensor_warming_up", {"offset": 10.0, "sets_in": 4.0})
+    slowly = {"film_coefficient": 5.0, "sets_in": 1.0, "fades": 3.0}
+    theta = apply(theta, "heat_nozzle_on_slowly", slowly)
+    dt, level = DT[:3000].copy(), np.full(3000, np.nan)
+    dt[[1000, 2000]] = 2.5, -1.0
+    level[[50, 1100, 2100, 2999]] = theta[c.AMBIENT]
+    phase = np.zeros(3000, np.uint8)
+    phase[200:1000] = Phase.SUCTION
+    if solver == "kernel":
+        state = kernel.new_state()
+        kernel.advance(state, theta, dt, phase, level, np.empty(3000))
+    else:
+        model = dense_solver.DenseSolver()
+        outputs = np.empty(3000), np.empty(3000, np.uint8)
+        dense_solver.advance(model, theta, dt, phase, level, *outputs)
+        state = model.now[:, 0]
+    clock = np.maximum(dt, 0.0).sum()
+    assert state[kernel.RUN] == pytest.approx(clock)
+    assert state[kernel.SET_IN] == pytest.approx(1.0 - np.exp(-clock / 4.0), rel=1e-6)
+    grown, faded_s = 1.0 - np.exp(-0.8), 1.8  # of the nozzle, while the model follows it
+    assert state[kernel.SET_IN + 1] == pytest.approx(grown * np.exp(-faded_s / 3.0), abs=0.03)
 
 
 def test_two_mechanisms_act_at_once_and_a_third_is_refused() -> None:
@@ -430,6 +456,19 @@ def cycling() -> Evidence:
     """A healthy gripper."""
     samples, _ = rigs.recorded("gripper", 10.0, (), 3)
     return collect(rigs.config("gripper"), [samples])
+
+
+def test_the_clock_of_cycles_that_are_not_adjacent_is_that_of_the_kernel() -> None:
+    """The time between them counts: a rhythm goes on meanwhile, and a sensor warms up."""
+    whole = cycling()
+    evidence = of_cycles(whole, [1, whole.cycles - 1])
+    assert np.diff(evidence.clock).max() > 1.0
+    rows = evidence.starts[1:] - 1
+    warms_up = (Cause("sensor_warming_up", {"offset": 9.0, "sets_in": 3.0}),)
+    states = evidence.states(warms_up, rows)
+    assert states[kernel.RUN] == pytest.approx(evidence.clock[rows])
+    assert evidence.clock[rows] == pytest.approx(evidence.seconds[rows] - evidence.seconds[0])
+    assert 9.0 * states[kernel.SET_IN] == pytest.approx(_drift(evidence, rows, warms_up), abs=1e-3)
 
 
 STEADY_LINE = Cause(

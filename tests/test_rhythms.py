@@ -73,9 +73,17 @@ def test_an_answer_belongs_to_the_last_pulse_before_it() -> None:
     """Two runs, with a pulse each in 1 s, the second one half a second later."""
     time = np.array([0.1, 0.6, 1.1, 1.6, 2.1])
     heard: Floats = np.array([[1.0, 0.0], [2.0, 3.0], [4.0, 5.0], [6.0, 7.0], [8.0, 9.0]])
-    divided = _divided(heard, time, 1.0, np.arange(5))
-    assert divided.shape == (5, 6)
+    divided, numbers = _divided(heard, time, 1.0, np.arange(5))
+    assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
     assert divided.sum(axis=1) == pytest.approx(heard.sum(axis=1))
     assert divided[4, 4] == 8.0
     assert divided[3, 3] == 7.0
-    assert not _divided(heard, time, 1.0, np.array([0]))[1:].any()
+    assert not _divided(heard, time, 1.0, np.array([0]))[0][1:].any()
+
+
+def test_pulses_of_a_gap_are_left_out() -> None:
+    """An hour between two bins is 36000 pulses of 0.1 s, and two are heard in each run."""
+    time, heard = np.array([0.45, 3600.45]), np.ones((2, 10))
+    divided, numbers = _divided(heard, time, 1.0, np.arange(2))
+    assert numbers.tolist() == [*range(6), *range(35996, 36006)]
+    assert divided.sum(axis=1).tolist() == [6.0, 10.0]

@@ -114,10 +114,10 @@ class _Answers:
         name = Mechanism(place, WHENS["pulsed"]).name
         tried = [(*causes, Cause(name, {**pulse, "shift": i * width})) for i in range(count)]
         off = evidence.off([causes, *tried])
-        parts = _divided(
+        parts, pulses = _divided(
             off[:, 1:] - off[:, :1], evidence.bins.mean(evidence.clock), period, weights.bins
         )
-        begins = width * np.arange(parts.shape[1], dtype=np.float64)
+        begins = width * pulses.astype(np.float64)
         answers = weights.white(parts)
         seen = answers.any(axis=0)
         residuals = white(evidence, weights, [causes])[:, 0]
@@ -131,21 +131,20 @@ class _Answers:
         return moved
 
 
-def _divided(answers: Floats, time: Floats, period: float, bins: Ints) -> Floats:
-    """Answers to repeated pulses by pulse, (bins of the deviation, pulses).
+def _divided(answers: Floats, time: Floats, period: float, bins: Ints) -> tuple[Floats, Ints]:
+    """Answers to repeated pulses by pulse, (bins of the deviation, pulses), and each one's number.
 
     A column of ``answers`` has pulses one ``period`` (s) apart; each is over when the next begins.
+    Pulses that none of the ``bins`` follows are left out: a long log has gaps without bins.
     """
     count = answers.shape[1]
-    width = period / count
-    turns = int((time.max() + width) / period) + 1
-    divided = np.zeros((len(answers), count * turns))
-    rows = np.arange(len(answers))
-    for number in range(count):
-        turn = np.floor((time - (number - 1) * width) / period).astype(np.int64)
-        heard = (turn >= 0) & np.isin(rows, bins)
-        divided[rows[heard], number + count * turn[heard]] = answers[heard, number]
-    return divided
+    begins = (np.arange(count) - 1) * period / count
+    turns = np.floor((time[bins, None] - begins) / period).astype(np.int64)
+    row, run = np.nonzero(turns >= 0)
+    numbers, column = np.unique(run + count * turns[row, run], return_inverse=True)
+    divided = np.zeros((len(answers), len(numbers)))
+    divided[bins[row], column] = answers[bins[row], run]
+    return divided, numbers
 
 
 def _on(periods: Floats, duty: float) -> Floats:

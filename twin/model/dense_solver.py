@@ -296,11 +296,14 @@ def _advance(
     kernel._advance_mechanisms(now, k, 0.0)
     for row in range(dt.shape[0]):
         is_broken = dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE
-        if not is_broken and now[VALID, 0] > 0.0 and dt[row] > 0.0:
+        waits = is_broken or now[VALID, 0] == 0.0
+        if not waits and dt[row] > 0.0:
             _advance_to_row(arrays, k, dt[row], tolerance)
-        if is_broken or phase[row] != now[PHASE, 0] or not math.isnan(level[row]):
+        if waits or phase[row] != now[PHASE, 0] or not math.isnan(level[row]):
             _truncate_step(arrays, k, tolerance)
-            now[VALID, 0] = 0.0 if is_broken else now[VALID, 0]
+            if waits:
+                now[VALID, 0] = 0.0
+                kernel._wait(now, k, max(dt[row], 0.0))
             kernel._enter_phases(now, phase[row : row + 1], k)
             kernel._synchronise(now, level[row : row + 1], k)
             _restart(arrays)

@@ -79,7 +79,7 @@ DRIVE, JET, BLOWING, DRAINED, SUPPLIED, SENSOR_STAGE, SENSED = range(9, ORDER)
 # of a step is ERROR_COEFFICIENT (Pa/s³) times the cube of its length. OPEN is above 0 while the cup
 # is open. VALID is 1 once the model was set to a measured level. SIGNALS are Signal bits. Last, for
 # each mechanism: its state (0 to 1), the share of its size that acts, and whether its vacuum is
-# reached. RUN is the time (s) that the model has run.
+# reached. RUN is the time (s) since the state was new; gaps count, breaks of time do not.
 NOZZLE, NOZZLE_COMMAND, NOZZLE_AGE, BLOW, BLOW_COMMAND, BLOW_AGE = range(ORDER, ORDER + 6)
 ERROR_COEFFICIENT, PHASE, OPEN, VALID, SIGNALS = range(ORDER + 6, ORDER + 11)
 SET_IN, ACTS, REACHED = ORDER + 11, ORDER + 11 + SLOTS, ORDER + 11 + 2 * SLOTS
@@ -540,10 +540,30 @@ def _advance_mechanisms(state: State, k: Prepared, h: float) -> None:
             if h > 0.0:
                 for slot in range(SLOTS):
                     _advance_mechanism(state, k, slot, h, i)
-                state[RUN, i] += h
                 after = _apply_mechanisms(state, k, i)
                 if state[VALID, i] > 0.0:
                     state[VESSEL, i] *= np.exp(GAMMA * np.log(before / after))
+        state[RUN, i] += h
+
+
+@compiled
+def _wait(state: State, k: Prepared, dt: float) -> None:
+    """Let ``dt`` seconds pass without a step, since the model waits for a synchronisation.
+
+    Rhythms go on, and what time alone drives sets in. Any other mechanism keeps its share: what
+    drove it meanwhile is not known.
+    """
+    for i in range(state.shape[1]):
+        state[RUN, i] += dt
+        if _has_mechanism(k, i):
+            for slot in range(SLOTS):
+                first = c.MECHANISMS + slot * WIDTH
+                if k[first + WHEN, i] in (ALWAYS, SWINGING, PULSED):
+                    missing = np.exp(-dt / max(k[first + SETS_IN, i], AT_ONCE))
+                    state[SET_IN + slot, i] = 1.0 - (1.0 - state[SET_IN + slot, i]) * missing
+                wave = _wave(k, first, state[RUN, i], AT_ONCE, i)
+                state[ACTS + slot, i] = wave * state[SET_IN + slot, i]
+            _apply_mechanisms(state, k, i)
 
 
 @inlined
@@ -683,8 +703,10 @@ def _advance_lanes(
     for row in range(dt.shape[0]):
         if dt[row] < 0.0 or dt[row] > LONGEST_BRIDGE:
             lanes[VALID] = 0.0
-        elif lanes[VALID, 0] > 0.0 and dt[row] > 0.0:
+        if dt[row] > 0.0 and lanes[VALID, 0] > 0.0:
             _step(lanes, k, dt[row], tolerance)
+        elif dt[row] > 0.0:
+            _wait(lanes, k, dt[row])
         for i in range(width):  # one column for all hypotheses, or one for each
             phases[i] = phase[row, min(first + i, last) % phase.shape[1]]
             levels[i] = level[row, min(first + i, last) % level.shape[1]]
