@@ -1,5 +1,7 @@
 """Periods, duties and phases from answers to short pulses."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from twin.diagnosis.rhythms import (
     _pulses,
     _spectra,
     _swings,
+    _typical_cycle,
 )
 from twin.monitor.bins import Floats
 
@@ -79,6 +82,19 @@ def test_an_answer_belongs_to_the_last_pulse_before_it() -> None:
     assert divided[4, 4] == 8.0
     assert divided[3, 3] == 7.0
     assert not _divided(heard, time, 1.0, np.array([0]))[0][1:].any()
+
+
+def test_cycles_that_wait_and_gaps_between_cycles_make_no_typical_cycle() -> None:
+    """One of five judged cycles waits for a minute, and an hour is missing before the last one."""
+    lasts = [2.4, 2.4, 62.4, 2.4, 2.3, 2.4]
+    rows = [np.arange(0.0, seconds, 0.1) for seconds in lasts]
+    begins = np.cumsum([0.0, *lasts[:-1]]) + 3600.0 * (np.arange(6) == 5)
+    evidence = SimpleNamespace(
+        clock=np.concatenate([begin + row for begin, row in zip(begins, rows, strict=True)]),
+        starts=np.cumsum([0, *map(len, rows)]),
+        judged=[1, 2, 3, 4, 5],
+    )
+    assert _typical_cycle(evidence) == pytest.approx(2.3)  # type: ignore[arg-type]
 
 
 def test_pulses_of_a_gap_are_left_out() -> None:

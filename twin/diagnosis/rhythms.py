@@ -28,7 +28,9 @@ DIFFERS = 0.1
 PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 400, 3
 SHORTEST = 0.05  # s, of a pulse
 MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of a mechanism
-LONGEST_PERIOD = {p.name: p.high for p in WHENS["pulsed"].parameters}["period"]  # s
+# Share of the judged cycles that are no longer than the typical one. The others may have waited.
+TYPICAL = 0.75
+LONGEST = {p.name: p.high for p in WHENS["pulsed"].parameters}  # s, of period and shift
 PHASES = 24  # parts of a period: a box begins and ends between two of them
 EARLIEST = 0.25  # periods: a first period that begins later leaves the fit room on both sides
 ENOUGH, ITERATIONS = 0.01, 300  # chi-square to which a box is refined; at most
@@ -42,12 +44,9 @@ def rhythmic_starts(
     There is none if the deviation is the same in each cycle, or if a cycle with one pulse more is
     longer than any period: then pulses cannot come once in a cycle.
     """
-    ends = np.minimum(evidence.starts, len(evidence.clock) - 1)
-    longest = float(np.diff(evidence.clock[ends]).max())
-    if (
-        longest * (1.0 + 1.0 / MOST_PULSES) > LONGEST_PERIOD
-        or _differs(evidence, weights, causes) <= DIFFERS
-    ):
+    typical = _typical_cycle(evidence)
+    is_too_long = typical * (1.0 + 1.0 / MOST_PULSES) > LONGEST["period"]
+    if is_too_long or _differs(evidence, weights, causes) <= DIFFERS:
         return []
     mechanisms = [one for one in MECHANISMS.values() if one.when.code in RHYTHMIC]
     duration = float(evidence.seconds[-1] - evidence.seconds[0])
@@ -55,7 +54,7 @@ def rhythmic_starts(
     for place in PLACES.values():
         of_place = [one for one in mechanisms if one.place is place]
         if of_place:
-            answers = _Answers.of(evidence, weights, causes, place, longest)
+            answers = _Answers.of(evidence, weights, causes, place, typical)
             period = of_place[0].when.parameters[0]
             spectra = _spectra(answers, _frequencies_of(duration, period.low, period.high))
             for one in of_place:
@@ -63,6 +62,14 @@ def rhythmic_starts(
                 shapes = _pulses(answers, spectra) if pulsed else _swings(spectra)
                 starts += [(one, _within(one, shape)) for shape in shapes]
     return starts
+
+
+def _typical_cycle(evidence: Evidence) -> float:
+    """Duration (s) of a typical judged cycle. What lies between cycles does not count."""
+    judged = np.array(evidence.judged, np.int64)
+    first, last = evidence.starts[judged], evidence.starts[judged + 1] - 1
+    durations = evidence.clock[last] - evidence.clock[first]
+    return float(np.quantile(durations, TYPICAL, method="lower"))
 
 
 def _differs(evidence: Evidence, weights: ResidualWhitener, causes: Hypothesis) -> float:
@@ -99,14 +106,15 @@ class _Answers:
         weights: ResidualWhitener,
         causes: Hypothesis,
         place: Place,
-        longest: float,
+        typical: float,
     ) -> "_Answers":
-        """Run the model with one pulse in a cycle, as often as pulses fit into the longest one.
+        """Run the model with one pulse in a cycle, as often as pulses fit into a typical one.
 
-        ``longest`` (s) is the duration of that cycle.
+        ``typical`` (s) is the duration of that cycle. In a longer one, the answer to a pulse ends
+        where the next pulse begins.
         """
-        width = max(SHORTEST, longest / MOST_PULSES)
-        count = int(np.ceil(longest / width))
+        width = max(SHORTEST, typical / MOST_PULSES)
+        count = int(np.ceil(typical / width))
         period = count * width
         (size,) = place.parameters
         duty = 100.0 * width / period
