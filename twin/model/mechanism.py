@@ -362,7 +362,7 @@ WHENS = {
                 for share in (0.0, 0.25)
             ),
             "to and fro with a period of {period}",
-            "share = sin(2 pi (t - {shift}) / {period})",
+            "share = sin(2 pi (t - {shift}) / {period}), with t from the first row evaluated",
             "to and fro",
         ),
         When(
@@ -371,7 +371,8 @@ WHENS = {
             (_PERIOD, _DUTY, _SHIFT),
             ((1.3, 40.0, 0.0),),
             "on and off with a period of {period}, on for {duty} of it",
-            "share = 1 for {duty} of each period of {period}, first from t = {shift} on; else 0",
+            "share = 1 while (t - {shift}) modulo {period} is below {duty} of {period}; else 0,"
+            " with t from the first row evaluated",
             "on and off in a rhythm of its own",
         ),
     )

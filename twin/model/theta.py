@@ -23,7 +23,10 @@ def _of_mechanism(slot: int) -> Mapping[str, tuple[str, str]]:
         f"MECHANISM_{slot}_SETS_IN": ("s", of + "time constant with which it sets in"),
         f"MECHANISM_{slot}_FADES": ("s", of + "time constant with which it fades"),
         f"MECHANISM_{slot}_PERIOD": ("s", of + "of its rhythm"),
-        f"MECHANISM_{slot}_SHIFT": ("s", of + "when its first period begins"),
+        f"MECHANISM_{slot}_SHIFT": (
+            "s",
+            of + "when one of its periods begins, since the model started",
+        ),
         f"MECHANISM_{slot}_DUTY": ("1", of + "share of its period for which it is on"),
     }
 
