@@ -4,13 +4,14 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,10 +47,12 @@ from twin.log.recorder import Recorder
 from twin.model import dense_solver, kernel
 from twin.model import mechanism as m
 from twin.model import theta as c
-from twin.model.courses import Cause
+from twin.model.catalogue import CatalogueEffect, Range, effects_in
+from twin.model.courses import Cause, Course
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply, effect_of
 from twin.model.theta import Theta
+from twin.monitor.bins import Floats
 from twin.settings import Document
 from twin.signals import MBAR, Command, Phase, Samples
 
@@ -409,6 +412,56 @@ def test_what_depends_on_the_time_in_the_log_moves_levels_as_it_is_at_each_switc
     assert np.abs(plain).max() > 6.0
     assert np.abs(drifting).max() < 2.0
     assert np.array_equal(pulsing, plain)
+
+
+@cache
+def warming_gauge() -> str:
+    """Name of an effect that a catalogue has: a sensor that warms up in 3 s."""
+    bounds = {
+        "offset": Range(low=-50.0, high=50.0, found=9.0),
+        "sets_in": Range(low=1.0, high=10.0, found=3.0),
+    }
+    sentence = "The gauge reads too high while it warms up"
+    entry = CatalogueEffect(mechanism="sensor_warming_up", sentence=sentence, parameters=bounds)
+    effects_in({"warming_gauge": entry})
+    return "warming_gauge"
+
+
+@pytest.mark.parametrize(
+    ("course", "expected_mbar"),
+    [
+        ({"course": Course.STEP, "onset_s": 4.0}, lambda t: 9.0 * (1.0 - np.exp(-(t - 4.0) / 3.0))),
+        (
+            {"course": Course.RAMP, "onset_s": 4.0},
+            lambda t: 9.0 / 3600.0 * (t - 4.0) * (1.0 - np.exp(-(t - 4.0) / 3.0)),
+        ),
+    ],
+)
+def test_a_sensor_that_warms_up_from_some_time_on_moves_levels_from_there_on(
+    course: dict[str, Any], expected_mbar: Callable[[Floats], Floats]
+) -> None:
+    evidence = cycling()
+    begins = evidence.seconds[evidence.starts[evidence.judged]]
+    time = np.repeat(begins, 2) + np.tile([0.4, 0.7], len(begins))
+    at = np.searchsorted(evidence.seconds, time)
+    cause = Cause(warming_gauge(), {"offset": 9.0}, **course)
+    expected = np.where(time > 4.0, expected_mbar(time), 0.0)
+    assert expected.any()
+    assert not expected.all()
+    assert _drift(evidence, at, (cause,)) == pytest.approx(expected, abs=0.01 * expected.max())
+
+
+def test_a_sensor_that_warms_up_in_some_cycles_moves_their_levels_alone() -> None:
+    evidence = cycling()
+    chosen = evidence.numbers[evidence.judged][::2]
+    intermittent = Course.INTERMITTENT
+    cause = Cause(warming_gauge(), {"offset": 9.0}, intermittent, cycles=frozenset(chosen))
+    at = evidence.starts[evidence.judged] + 400
+    drift = _drift(evidence, at, (cause,))
+    length = np.median(np.diff(evidence.clock[evidence.starts[:-1]]))
+    acted = 0.4 + length * np.arange(len(at)) / 2.0
+    expected = np.where(np.arange(len(at)) % 2 == 0, 9.0 * (1.0 - np.exp(-acted / 3.0)), 0.0)
+    assert drift == pytest.approx(expected, rel=0.02)
 
 
 @cache

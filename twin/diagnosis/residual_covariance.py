@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis
@@ -378,12 +379,20 @@ def _drift(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Floats:
     for cause in hypothesis:
         if not apart or mechanism_of(cause.effect) != WARMING_SENSOR:
             continue
-        values = {
-            p.name: cause.values.get(p.name, p.neutral(evidence.theta))
-            for p in effect_of(cause.effect).parameters
-        }
-        drift += values["offset"] * (1.0 - np.exp(-evidence.clock[at] / values["sets_in"]))
+        neutral = {p.name: p.neutral(evidence.theta) for p in effect_of(cause.effect).parameters}
+        acted = np.cumsum(np.diff(evidence.clock, prepend=0.0) * _acting(evidence, cause))
+        for i, row in enumerate(at):
+            second, cycle = float(evidence.seconds[row]), int(evidence.cycle_of_row[row])
+            values = {**neutral, **cause.at(evidence.theta, second, cycle)}
+            drift[i] += values["offset"] * (1.0 - math.exp(-acted[row] / values["sets_in"]))
     return drift
+
+
+def _acting(evidence: Evidence, cause: Cause) -> npt.NDArray[np.bool_]:
+    """Rows in which a cause acts."""
+    if cause.course == Course.INTERMITTENT:
+        return np.isin(evidence.cycle_of_row, list(cause.cycles))
+    return (cause.course == Course.CONSTANT) | (evidence.seconds >= cause.onset_s)
 
 
 def _nodes(evidence: Evidence, at: Ints, hypothesis: Hypothesis) -> Ints:
