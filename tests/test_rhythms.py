@@ -17,7 +17,9 @@ from twin.diagnosis.rhythms import (
     _spectra,
     _swings,
     _typical_cycle,
+    _within,
 )
+from twin.model.mechanism import MECHANISMS
 from twin.monitor.bins import Floats
 
 WIDTH, COUNT = 0.05, 480  # s; pulses of 24 s
@@ -103,3 +105,22 @@ def test_pulses_of_a_gap_are_left_out() -> None:
     divided, numbers = _divided(heard, time, 1.0, np.arange(2))
     assert numbers.tolist() == [*range(6), *range(35996, 36006)]
     assert divided.sum(axis=1).tolist() == [6.0, 10.0]
+
+
+def test_a_pulse_of_a_long_period_stays_where_it_is() -> None:
+    """Its shift may be 120 s at most: then it begins one period earlier."""
+    pulsed, swinging = MECHANISMS["supply_pulsed"], MECHANISMS["supply_swinging"]
+    assert _within(pulsed, (110.0, 40.0, 130.0)) == pytest.approx((110.0, 40.0, 20.0))
+    assert _within(pulsed, (110.0, 40.0, 115.0)) == pytest.approx((110.0, 40.0, 115.0))
+    assert _within(swinging, (110.0, 30.0)) == pytest.approx((110.0, 30.0))
+
+
+@pytest.mark.parametrize("end", [0, -1])
+def test_a_box_is_refined_within_the_periods_that_are_searched(end: int) -> None:
+    """The pulse itself is a step outside of them."""
+    frequencies = _frequencies_of(24.0, 1.0, 6.0)
+    step = frequencies[1] - frequencies[0]
+    outside = float(frequencies[end]) + (step if end else -step)
+    heard = answers(1.0 / outside, 0.4, 0.3)
+    for period, *_ in _pulses(heard, _spectra(heard, frequencies)):
+        assert 1.0 / frequencies[-1] <= period <= 1.0 / frequencies[0]

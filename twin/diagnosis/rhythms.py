@@ -238,9 +238,10 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
     A box is shifted in the middle of the log, so that another period does not move it.
     """
     middle = float(np.mean(answers.begins))
+    lowest, highest = spectra.frequencies[[0, -1]]
 
     def shape(x: Floats) -> tuple[float, float, float]:
-        period = 1.0 / float(x[0])
+        period = 1.0 / float(np.clip(x[0], lowest, highest))
         return period, float(np.clip(x[1], 0.02, 0.98)), middle + float(x[2]) * period
 
     def misfit(x: Floats) -> float:
@@ -268,8 +269,9 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
 
 
 def _within(mechanism: Mechanism, shape: tuple[float, ...]) -> tuple[float, ...]:
-    """A shape within the bounds of the parameters."""
+    """A shape within the bounds of the parameters; a shift beyond its own is a period less."""
     table = mechanism.when.parameters
-    return tuple(
-        float(np.clip(value, p.low, p.high)) for value, p in zip(shape, table, strict=True)
-    )
+    values = {p.name: value for p, value in zip(table, shape, strict=True)}
+    if values["shift"] > LONGEST["shift"]:
+        values["shift"] -= values["period"]
+    return tuple(float(np.clip(values[p.name], p.low, p.high)) for p in table)
