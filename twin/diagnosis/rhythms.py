@@ -23,9 +23,10 @@ from twin.monitor.bins import Floats, Ints
 # rhythms. Chosen: a swinging supply has 0.3 to 0.8; leaks, vapour and ice up to 0.06.
 DIFFERS = 0.1
 # The periodogram has frequencies half a line width (1 / duration) apart: a fit that begins farther
-# from a line does not reach it. MOST_FREQUENCIES bounds the computing time; on a long log the
-# fastest rhythms are then not searched.
-PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 400, 3
+# from a line does not reach it. MOST_FREQUENCIES bounds the computing time; on a log of more than
+# 200 s the fastest rhythms are then not searched. A frequency takes 0.6 ms with 480 pulses, as in a
+# log of 24 s, and 10 ms with 2000.
+PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 2000, 3
 SHORTEST = 0.05  # s, of a pulse
 MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of a mechanism
 # Share of the judged cycles that are no longer than the typical one. The others may have waited.
