@@ -20,7 +20,14 @@ from drivers.plc.simulate import with_truth
 from twin.config import Config
 from twin.diagnosis import another_log
 from twin.diagnosis import answer as answer_module
-from twin.diagnosis.another_log import _other_program, conditions, judged_on, program
+from twin.diagnosis.another_log import (
+    PHASES,
+    _other_program,
+    _phases,
+    conditions,
+    judged_on,
+    program,
+)
 from twin.diagnosis.answer import Diagnosis
 from twin.diagnosis.evidence import Evidence, collect
 from twin.diagnosis.text import on_another_log
@@ -335,3 +342,10 @@ def test_the_command_line_hands_on_what_the_other_log_says(
     monkeypatch.setattr(another_log, "judged_on", judged)
     assert twin(monkeypatch, "diagnose", folder / "short.mcap", "--judge-on", other) == 0
     assert [config.data.supply.pressure_bar for config in handed] == [4.2]
+
+
+@pytest.mark.parametrize(("duty", "count"), [(2.0, 200), (3.1, 130), (40.0, PHASES)])
+def test_a_short_pulse_is_tried_at_four_phases_in_it(duty: float, count: int) -> None:
+    values = {"drop": 1.0, "period": 10.0, "shift": 0.0}
+    assert _phases(Cause("supply_pulsed", {**values, "duty": duty})) == count
+    assert _phases(Cause("supply_swinging", values)) == PHASES

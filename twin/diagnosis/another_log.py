@@ -1,5 +1,6 @@
 """Judge the extended model on another log, on which nothing was fitted or chosen."""
 
+import math
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Any
@@ -22,7 +23,9 @@ from twin.monitor.prediction_cache import LONGER, LONGER_MS
 from twin.signals import MS, NS, Command, Samples
 
 OF_A_ROW = 1.5  # rows by which a median may be off: commands are seen at the next row
-PHASES = 24  # of a rhythm that are tried on another log
+# Phases of a rhythm that are tried on another log, at least; and in each pulse, since a pulse that
+# is off by as much as it lasts explains nothing.
+PHASES, IN_A_PULSE = 24, 4
 STRETCHES = ("suction", "blow-off", "idle")
 SUPPLY = ("supply", "pressure_bar")
 # What a person changes on a rig between two logs. A sensor that counts from ambient counts from the
@@ -174,9 +177,14 @@ def _judged(evidence: Evidence, cycles: list[int], rhythmic: Hypothesis = HEALTH
 def _in_phase(evidence: Evidence, cycles: list[int], cause: Cause) -> Cause:
     """The rhythmic cause with the phase that suits some cycles of a log best."""
     period = cause.values["period"]
-    shifts = np.linspace(0.0, period, PHASES, endpoint=False)
+    shifts = np.linspace(0.0, period, _phases(cause), endpoint=False)
     causes = [replace(cause, values={**cause.values, "shift": float(s)}) for s in shifts]
     bins = np.isin(evidence.bins.cycle, cycles)
     off = evidence.off([(shifted,) for shifted in causes])[bins]
     squares = np.average(off**2, axis=0, weights=evidence.bins.count[bins])
     return causes[int(np.argmin(squares))]
+
+
+def _phases(cause: Cause) -> int:
+    """Number of phases of a rhythm that are tried; a swing is on for half of its period."""
+    return max(PHASES, math.ceil(IN_A_PULSE * 100.0 / cause.values.get("duty", 50.0)))
