@@ -74,6 +74,16 @@ def test_the_gain_of_a_box_is_that_of_least_squares() -> None:
         assert gains[first, number - 1] == pytest.approx(expected)
 
 
+def test_phases_that_no_bin_hears_gain_nothing() -> None:
+    """Rounding is all that they have: it would divide by next to nothing."""
+    heard = answers(1.7, 0.4, 0.3)
+    folded = _folded(heard, 1.0 / 1.7, np.arange(PHASES + 1) / PHASES)
+    folded[:, 5:8] *= 1e-13
+    gains = _box_gains(folded.T @ folded, -folded.T @ heard.residuals)
+    assert gains.max() <= heard.residuals @ heard.residuals
+    assert gains[5, :3].max() < 1e-9
+
+
 def test_an_answer_belongs_to_the_last_pulse_before_it() -> None:
     """Two runs, with a pulse each in 1 s, the second one half a second later."""
     time = np.array([0.1, 0.6, 1.1, 1.6, 2.1])

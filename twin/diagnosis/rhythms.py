@@ -34,6 +34,9 @@ TYPICAL = 0.75
 LONGEST = {p.name: p.high for p in WHENS["pulsed"].parameters}  # s, of period and shift
 PHASES = 24  # parts of a period: a box begins and ends between two of them
 EARLIEST = 0.25  # periods: a first period that begins later leaves the fit room on both sides
+# Share of the information of all phases below which that of a box is rounding: no bin hears it. The
+# cycles of a long log may all miss the same phases of a period.
+UNHEARD = 1e-9
 ENOUGH, ITERATIONS = 0.01, 300  # chi-square to which a box is refined; at most
 
 
@@ -214,7 +217,8 @@ def _box_gains(information: Floats, gradient: Floats) -> Floats:
     first = np.arange(PHASES)[:, None]
     last = first + np.arange(1, PHASES)
     squares = sums[last, last] - sums[first, last] - sums[last, first] + sums[first, first]
-    gains: Floats = (pulls[last] - pulls[first]) ** 2 / np.maximum(squares, np.finfo(float).tiny)
+    least = UNHEARD * float(np.trace(information))
+    gains: Floats = (pulls[last] - pulls[first]) ** 2 / np.maximum(squares, least)
     return gains
 
 
