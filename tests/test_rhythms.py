@@ -1,5 +1,6 @@
 """Periods, duties and phases from answers to short pulses."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from twin.diagnosis.rhythms import (
     EARLIEST,
+    PEAKS,
     PHASES,
     _Answers,
     _box_gains,
@@ -82,6 +84,18 @@ def test_phases_that_no_bin_hears_gain_nothing() -> None:
     gains = _box_gains(folded.T @ folded, -folded.T @ heard.residuals)
     assert gains.max() <= heard.residuals @ heard.residuals
     assert gains[5, :3].max() < 1e-9
+
+
+def test_a_pulse_beside_whose_peak_others_are_higher_comes_first_all_the_same() -> None:
+    heard = answers(1.7, 0.4, 0.6)
+    spectra = _spectra(heard, FREQUENCIES)
+    gains = spectra.of_box.copy()
+    right = int(np.argmax(gains))
+    others = np.setdiff1d(np.arange(5, 60, 5), range(right - 2, right + 3))
+    gains[others] += gains[right]
+    found = _pulses(heard, replace(spectra, of_box=gains))
+    assert found[0][0] == pytest.approx(1.7, rel=0.01)
+    assert len(found) == PEAKS
 
 
 def test_an_answer_belongs_to_the_last_pulse_before_it() -> None:

@@ -27,6 +27,10 @@ DIFFERS = 0.1
 # 200 s the fastest rhythms are then not searched. A frequency takes 0.6 ms with 480 pulses, as in a
 # log of 24 s, and 10 ms with 2000.
 PER_LINE, MOST_FREQUENCIES, PEAKS = 2.0, 2000, 3
+# Peaks of a box that are refined; the best PEAKS of them are starts. Its line is narrower than that
+# of a wave, so the peak may lie beside it: of cycles spread over 150 s, the right one was not among
+# the highest three.
+REFINED = 12
 SHORTEST = 0.05  # s, of a pulse
 MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of a mechanism
 # Share of the judged cycles that are no longer than the typical one. The others may have waited.
@@ -222,11 +226,11 @@ def _box_gains(information: Floats, gradient: Floats) -> Floats:
     return gains
 
 
-def _peaks(gains: Floats) -> Ints:
-    """Where the highest peaks are, the highest first."""
+def _peaks(gains: Floats, count: int = PEAKS) -> Ints:
+    """Where the highest peaks are, the highest first; ``count`` at most."""
     around = np.pad(gains, 1, constant_values=-np.inf)
     peaks = np.flatnonzero((gains >= around[:-2]) & (gains >= around[2:]))
-    return peaks[np.argsort(-gains[peaks])[:PEAKS]]
+    return peaks[np.argsort(-gains[peaks])[:count]]
 
 
 def _swings(spectra: _Spectra) -> list[tuple[float, ...]]:
@@ -238,7 +242,7 @@ def _swings(spectra: _Spectra) -> list[tuple[float, ...]]:
 
 
 def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
-    """Period (s), duty (%) and shift (s) at the highest peaks of a box, refined one by one.
+    """Period (s), duty (%) and shift (s) of the best boxes, refined from the highest peaks.
 
     A box is shifted in the middle of the log, so that another period does not move it.
     """
@@ -254,8 +258,8 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
         pull = float(moved @ answers.residuals)
         return -(pull**2) / max(float(moved @ moved), np.finfo(float).tiny)
 
-    found = list[tuple[float, ...]]()
-    for i in _peaks(spectra.of_box):
+    found = list[tuple[float, tuple[float, ...]]]()
+    for i in _peaks(spectra.of_box, REFINED):
         frequency, (first, number) = float(spectra.frequencies[i]), spectra.box[i]
         phase = first / PHASES - middle * frequency % 1.0
         start: Floats = np.array([frequency, number / PHASES, phase], np.float64)
@@ -269,8 +273,9 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
         )
         period, duty, shift = shape(best.x)
         earliest = EARLIEST * period
-        found.append((period, 100.0 * duty, earliest + (shift - earliest) % period))
-    return found
+        refined = period, 100.0 * duty, earliest + (shift - earliest) % period
+        found.append((float(best.fun), refined))
+    return [refined for _, refined in sorted(found)[:PEAKS]]
 
 
 def _within(mechanism: Mechanism, shape: tuple[float, ...]) -> tuple[float, ...]:
