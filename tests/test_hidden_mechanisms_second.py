@@ -27,8 +27,7 @@ def commissioned() -> battery_second.Met:
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # a commissioning, on a computer that does other things beside
 @pytest.mark.parametrize(
-    "effect",
-    ["second_ejector", "filling_silencer", "blow_off_valve_leak", "sensor_thermal_drift"],
+    "effect", ["filling_silencer", "blow_off_valve_leak", "sensor_thermal_drift"]
 )
 def test_what_is_hidden_is_found_with_its_place_and_its_way_of_acting(effect: str) -> None:
     met = commissioned()

@@ -680,8 +680,8 @@ def by_fit(
     """Remarks on ambient pressure and on the sensor's place; those of a bad fit mean nothing.
 
     ``judged_from`` fits and judges from a start at which the sensor stays. If that gets the same
-    verdict where the configuration has the sensor, the place is no contradiction: a short tube has
-    nearly the same pressure at both ends, and a fit goes to either.
+    verdict with the sensor as configured, the place is no contradiction: a short tube has nearly
+    the same pressure at both ends, and a fit goes to either.
     """
     if verdict.word == "refused":
         return []
