@@ -35,7 +35,7 @@ SHORTEST = 0.05  # s, of a pulse
 MOST_PULSES = 48  # in a cycle: each is on for more of it than the least duty of a mechanism
 # Share of the judged cycles that are no longer than the typical one. The others may have waited.
 TYPICAL = 0.75
-LONGEST = {p.name: p.high for p in WHENS["pulsed"].parameters}  # s, of period and shift
+BOUNDS = {p.name: (p.low, p.high) for p in WHENS["pulsed"].parameters}  # s, duty in %
 PHASES = 24  # parts of a period: a box begins and ends between two of them
 EARLIEST = 0.25  # periods: a first period that begins later leaves the fit room on both sides
 # Share of the information of all phases below which that of a box is rounding: no bin hears it. The
@@ -53,7 +53,7 @@ def rhythmic_starts(
     longer than any period: then pulses cannot come once in a cycle.
     """
     typical = _typical_cycle(evidence)
-    is_too_long = typical * (1.0 + 1.0 / MOST_PULSES) > LONGEST["period"]
+    is_too_long = typical * (1.0 + 1.0 / MOST_PULSES) > BOUNDS["period"][1]
     if is_too_long or _differs(evidence, weights, causes) <= DIFFERS:
         return []
     mechanisms = [one for one in MECHANISMS.values() if one.when.code in RHYTHMIC]
@@ -248,10 +248,11 @@ def _pulses(answers: _Answers, spectra: _Spectra) -> list[tuple[float, ...]]:
     """
     middle = float(np.mean(answers.begins))
     lowest, highest = spectra.frequencies[[0, -1]]
+    duties = np.array(BOUNDS["duty"]) / 100.0
 
     def shape(x: Floats) -> tuple[float, float, float]:
         period = 1.0 / float(np.clip(x[0], lowest, highest))
-        return period, float(np.clip(x[1], 0.02, 0.98)), middle + float(x[2]) * period
+        return period, float(np.clip(x[1], *duties)), middle + float(x[2]) * period
 
     def misfit(x: Floats) -> float:
         moved = answers.of_rhythm(*shape(x))
@@ -282,6 +283,6 @@ def _within(mechanism: Mechanism, shape: tuple[float, ...]) -> tuple[float, ...]
     """A shape within the bounds of the parameters; a shift beyond its own is a period less."""
     table = mechanism.when.parameters
     values = {p.name: value for p, value in zip(table, shape, strict=True)}
-    if values["shift"] > LONGEST["shift"]:
+    if values["shift"] > BOUNDS["shift"][1]:
         values["shift"] -= values["period"]
     return tuple(float(np.clip(values[p.name], p.low, p.high)) for p in table)
