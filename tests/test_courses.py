@@ -141,3 +141,16 @@ def test_added_volume_joins_with_gas_in_the_vessels_own_state(volume: float) -> 
     dt, phase, level = np.full(50, MS), np.zeros(50, "u1"), np.full(50, np.nan)
     kernel.advance(state, grown, dt, phase, level, read)
     assert read == pytest.approx(theta[c.AMBIENT], abs=1e-3)  # no jump in temperature either
+
+
+@pytest.mark.parametrize("span_s", [5.0, 3600.0])
+def test_a_ramp_grows_by_less_than_noise_at_once(span_s: float) -> None:
+    """Also in a log of seconds: each step would otherwise look like a switching of something."""
+    theta, rows = rigs.theta("test_rig"), 20_000
+    seconds = np.linspace(0.0, span_s, rows)
+    wrong = Cause("sensor_gain", {"error": 5.0 * HOUR / span_s}, Course.RAMP)
+    course = schedule(theta, [wrong], seconds, np.zeros(rows, np.int64))
+    gains = np.array([coefficients[c.SENSOR_GAIN] for _, coefficients in course])
+    reached = 0.05 * theta[c.SENSOR_GAIN]
+    assert gains[-1] - theta[c.SENSOR_GAIN] == pytest.approx(reached, rel=0.005)
+    assert np.diff(gains).max() < 0.006 * reached

@@ -15,7 +15,9 @@ from twin.model.effects import apply, effect_of
 from twin.model.theta import Theta
 
 HOUR = 3600.0  # s
-RAMP_STEP = 0.5  # s; the coefficients of a ramp change so often, to their values in mid-step
+# Steps of a ramp's coefficients from its onset to the last row, each to the value in mid-step. So a
+# step is 0.5 % of what the ramp reaches: below noise, also in a log of seconds.
+RAMP_STEPS = 200
 
 # Coefficients over time: pairs of a first row and the coefficients from it on, beginning at row 0.
 Schedule = list[tuple[int, Theta]]
@@ -85,14 +87,21 @@ def schedule(
     out of bounds.
     """
     changes: Schedule = []
+    half_steps = [_ramp_step(cause, seconds) / 2.0 for cause in causes]
     for row in _changes(causes, seconds, cycles):
         changed = theta
-        for cause in causes:
-            ahead = RAMP_STEP / 2.0 if cause.course == Course.RAMP else 0.0
-            values = cause.at(changed, float(seconds[row]) + ahead, int(cycles[row]))
+        for cause, half_step in zip(causes, half_steps, strict=True):
+            values = cause.at(changed, float(seconds[row]) + half_step, int(cycles[row]))
             changed = apply(changed, cause.effect, values)
         changes.append((row, changed))
     return changes
+
+
+def _ramp_step(cause: Cause, seconds: npt.NDArray[np.float64]) -> float:
+    """Time (s) between two changes of a ramp's coefficients; 0 for other courses."""
+    if cause.course != Course.RAMP or not len(seconds):
+        return 0.0
+    return max(float(seconds[-1]) - cause.onset_s, 0.0) / RAMP_STEPS
 
 
 def _changes(
@@ -105,8 +114,8 @@ def _changes(
         times: npt.NDArray[np.float64] = np.empty(0)
         if cause.course == Course.STEP:
             times = np.array([cause.onset_s])
-        elif cause.course == Course.RAMP and len(seconds):
-            times = np.arange(cause.onset_s, seconds[-1], RAMP_STEP)
+        elif step := _ramp_step(cause, seconds):
+            times = cause.onset_s + step * np.arange(RAMP_STEPS)
         elif cause.course == Course.INTERMITTENT:
             rows |= set((np.flatnonzero(np.diff(cycles)) + 1).tolist())
         rows |= set(np.searchsorted(seconds, times).tolist())
