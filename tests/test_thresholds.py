@@ -163,3 +163,18 @@ def test_a_turn_that_the_record_does_not_show_stays_unknown() -> None:
     decisions = decided(readings, Cycles.found(samples, data), coefficients(data))
     assert np.isnan(decisions.on)
     assert decisions.off > readings.off
+
+
+def test_a_turn_by_a_wave_in_the_hose_is_no_threshold() -> None:
+    data, samples, _ = recorded(0)
+    readings, cycles = read(samples), Cycles.found(samples, data)
+    rows, goes_on = cycles.switchings
+    phase = cycles.phase.copy()
+    for row in rows[goes_on]:
+        stays_on = phase[row:] == Phase.SUCTION
+        phase[row : row + int(np.argmin(stays_on))] = Phase.HOLD
+    never_on = replace(cycles, phase=phase)
+    assert goes_on.any()
+    assert not never_on.switchings[1].any()
+    assert np.isfinite(readings.on)
+    assert np.isnan(decided(readings, never_on, coefficients(data)).on)

@@ -172,7 +172,7 @@ def commission(
     readings = read(samples)
     refuse_unreadable(readings)
     optimum_is_told = "optimum_bar" in config.data.supply.model_fields_set
-    unseen_level = _unseen_level(config.data, readings)
+    hysteresis_is_told = "h1_hysteresis_mbar" in config.data.ejector.model_fields_set
     gauged, by_gauge = as_gauged(config.data, samples)
     config = replace(config, data=taken_in(gauged, samples))
     refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
@@ -218,7 +218,7 @@ def commission(
     )
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
-    fitted, remarks = _deciding(fitted, found_cycles, metered, readings)
+    fitted, remarks, readings = _deciding(fitted, found_cycles, metered, readings)
     known = with_known_place(free)
     of_fit = by_fit(
         config.data,
@@ -231,8 +231,8 @@ def commission(
     remarks = [*by_gauge, *by_flow, *remarks, *of_fit]
     cycles = complete(fitted.data, samples)
     sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
-    healthy = _healthy(replace(config, data=fitted.data), fitted, cycles, samples, sigma)
-    healthy = healthy.model_copy(update={"unseen_level_mbar": unseen_level})
+    unseen_level = _unseen_level(readings, is_told=hysteresis_is_told)
+    healthy = _healthy(config, fitted, cycles, samples, sigma, unseen_level)
     times = samples["host_ns"]
     ends = int(times[0]), int(times[-1])
     calibration = Calibration(fitted, verdict, healthy, len(cycles), *ends)
@@ -251,19 +251,29 @@ def _doubts(config: Config, calibration: Calibration, readings: Readings) -> tup
 
 
 def _healthy(
-    config: Config, fitted: Fitted, cycles: Sequence[Cycle], samples: Samples, optimum: float
+    config: Config,
+    fitted: Fitted,
+    cycles: Sequence[Cycle],
+    samples: Samples,
+    optimum: float,
+    unseen_level: float,
 ) -> Healthy:
-    """The healthy scatter of ``cycles``; ``optimum`` (bar) is the sigma of the optimum pressure.
+    """The healthy scatter of ``cycles``.
 
-    It is 0 if it is configured.
+    ``optimum`` is one sigma (bar) of the optimum pressure, 0 if it is configured; ``unseen_level``
+    one sigma (mbar) of a switching level that no cycle shows.
     """
     untold = {"supply.optimum_bar": optimum} if optimum else {}
-    return like_these(config, fitted, scatter(fitted.data, cycles), samples, untold)
+    as_fitted = replace(config, data=fitted.data)
+    healthy = like_these(as_fitted, fitted, scatter(fitted.data, cycles), samples, untold)
+    return healthy.model_copy(update={"unseen_level_mbar": unseen_level})
 
 
-def _unseen_level(data: DataSet, readings: Readings) -> float:
-    """One sigma (mbar) of the vacuum at which the nozzle goes on again, for later records."""
-    is_told = "h1_hysteresis_mbar" in data.ejector.model_fields_set
+def _unseen_level(readings: Readings, *, is_told: bool) -> float:
+    """One sigma (mbar) of the vacuum at which the nozzle goes on again, for later records.
+
+    ``is_told`` says whether the hysteresis is configured.
+    """
     return UNSEEN_LEVEL_MBAR if is_told or np.isfinite(readings.on) else HYSTERESIS_UNTOLD
 
 
@@ -376,16 +386,17 @@ def other_tubes(guesses: Sequence[DataSet], best: DataSet) -> list[DataSet]:
 
 def _deciding(
     fitted: Fitted, cycles: Cycles, configured: DataSet, readings: Readings
-) -> tuple[Fitted, list[Remark]]:
+) -> tuple[Fitted, list[Remark], Readings]:
     """The fit with thresholds where the control decides in ``cycles``, and remarks as ``guessed``.
 
-    Until the fit they are where the pressure turns.
+    Until the fit they are where the pressure turns. The third value are the readings with these
+    thresholds.
     """
     if not readings.saves_air:
-        return fitted, guessed(configured, readings)[1]
+        return fitted, guessed(configured, readings)[1], readings
     decisions = decided(readings, cycles, coefficients(fitted.data))
     guess, remarks = guessed(configured, decisions)
-    return replace(fitted, data=switching_as(guess, fitted.data)), remarks
+    return replace(fitted, data=switching_as(guess, fitted.data)), remarks, decisions
 
 
 def switching_as(guess: DataSet, data: DataSet) -> DataSet:

@@ -19,7 +19,8 @@ def decided(readings: Readings, cycles: Cycles, theta: Theta) -> Readings:
     """``readings`` with ``off`` and ``on`` where the control decides, for the fitted ``theta``.
 
     A threshold cannot lie beyond the turn of the pressure that it leads to. A turn that the record
-    does not show (NaN) stays unknown.
+    does not show (NaN) stays unknown. ``on`` is unknown as well if ``cycles`` do not show that the
+    nozzle goes on again: waves in a hose turn the pressure, too.
     """
     early, _ = cycles.best_early(theta)
     pressure = cycles.control_pressure(theta, early)
@@ -27,7 +28,7 @@ def decided(readings: Readings, cycles: Cycles, theta: Theta) -> Readings:
     rows = rows - early
     off = _before(pressure, rows[~is_on], float(theta[c.RESPONSE_OFF]) / cycles.period)
     on = _before(pressure, rows[is_on], float(theta[c.RESPONSE]) / cycles.period)
-    on = np.nan if np.isnan(readings.on) else float(np.fmin(readings.on, on))
+    on = float(np.minimum(readings.on, on)) if is_on.any() else np.nan
     return replace(readings, off=float(np.fmax(readings.off, off)), on=on)
 
 

@@ -111,7 +111,7 @@ def _changes(
     rows = {0}
     for cause in causes:
         effect_of(cause.effect)
-        times: npt.NDArray[np.float64] = np.empty(0)
+        times: npt.NDArray[np.floating] = np.empty(0)
         if cause.course == Course.STEP:
             times = np.array([cause.onset_s])
         elif step := _ramp_step(cause, seconds):
