@@ -772,6 +772,18 @@ def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:
     assert kept.effects == ("leakage",)
 
 
+def test_a_cause_too_small_to_matter_is_none_though_it_predicts_unseen_cycles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A likelier rival takes the place of what was found, whatever its size."""
+    evidence = collect(CONFIG, record(27.0, "suction_loss=1.2", seed=21))
+    fitted = evidence.judged[::2]
+    worn = _about(evidence, fitted, (Cause("suction_loss", {"loss": 1.2}),))
+    assert _confirmed(evidence, fitted, worn) is None
+    monkeypatch.setattr(search_module, "SMALLEST", 0.0)
+    assert _confirmed(evidence, fitted, worn) is not None
+
+
 @cache
 def with_leak_and_heat() -> tuple[Evidence, list[int]]:
     """A leak whose gas is warmed by the wall more than usual, and the fitted cycles."""

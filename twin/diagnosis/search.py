@@ -676,9 +676,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(evidence, found)
-        if (
-            alternatives and min(sizes_found) < SMALLEST_MORE
-        ):  # beside the others it became too small
+        if min(sizes_found) < (SMALLEST_MORE if alternatives else SMALLEST):
             weakest = sizes_found.index(min(sizes_found))
         elif gains[weakest][0] > LEAST_UNSEEN:
             return found
