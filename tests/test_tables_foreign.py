@@ -3,7 +3,7 @@
 import tomllib
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, time, timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -451,6 +451,24 @@ def test_of_several_times_one_is_proposed() -> None:
     assert likely_columns(["Zeit", "x"]) == {}
 
 
+def test_a_date_and_a_time_of_day_are_proposed_as_such() -> None:
+    assert likely_columns(["Uhrzeit", "Datum"]) == {Column.DATE: "Datum", Column.TIME: "Uhrzeit"}
+    assert likely_columns(["Date", "Time"]) == {Column.DATE: "Date", Column.TIME: "Time"}
+    assert likely_columns(["Datum", "x"]) == {Column.TIME: "Datum"}
+    assert likely_columns(["Zeitstempel"]) == {Column.TIME: "Zeitstempel"}
+
+
+def test_how_to_read_a_transmitter_is_shown_by_example(tmp_path: Path) -> None:
+    path = written(tmp_path, "time_ms;suction;blow_off;AI1 [V]\n0;0;0;1\n")
+    with pytest.raises(SourceError) as caught:
+        open_table(path, settings({}), AMBIENT)
+    lines = caught.value.hint.rpartition("[import.columns]")[2]
+    read = tomllib.loads(lines)["pressure"]
+    assert read["name"] == "AI1 [V]"
+    assert read["signal"] == [0, 10]
+    open_table(path, settings({"pressure": read}), AMBIENT)
+
+
 # --- Excel --------------------------------------------------------------------------------------
 
 
@@ -463,6 +481,28 @@ def workbook(path: Path, *rows: list[Any]) -> Path:
     book.create_sheet("Notes").append(["nothing"])
     book.save(path)
     return path
+
+
+def test_a_column_that_another_sheet_may_have(tmp_path: Path) -> None:
+    path = workbook(tmp_path / "t.xlsx", ["Machine 7"])
+    with pytest.raises(SourceError, match="no column time_s") as caught:
+        open_table(path, settings({}), AMBIENT)
+    assert "sheet 'Sheet' is read; sheet of [import] chooses 'Notes'" in caught.value.hint
+
+
+def test_date_and_time_in_cells_of_their_own(tmp_path: Path) -> None:
+    path = workbook(
+        tmp_path / "t.xlsx",
+        ["Datum", "Uhrzeit", "suction", "blow_off", "pressure_mbar"],
+        [date(2026, 3, 1), time(12, 0), 0, 0, 1000],
+        [date(2026, 3, 1), time(12, 0, 0, 10_000), 1, 0, 999],
+    )
+    how = settings({"date": "Datum", "time": "Uhrzeit"}, time_zone="UTC")
+    rows = taken(path, how)
+    noon = datetime(2026, 3, 1, 12, tzinfo=UTC)
+    assert rows["time_ns"].tolist() == [
+        int(noon.timestamp()) * 10**9 + ms * 10**6 for ms in (0, 10)
+    ]
 
 
 def test_a_sheet_is_read(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from twin.tables.numbers import Numbers, as_numbers, plain
 
 _FILE_TIME = r"^[0-9]{17,18}$"
 _SINCE_1601 = 11_644_473_600 * 10_000_000  # of 100 ns, to 1970
+_MIDNIGHT = r"[T ]+0?0:00(:00([.,]0+)?)?$"  # which spreadsheets and databases add to a date
 _DAY_OF_NONE = "1970-01-01 "
 _OFFSET = r"[0-9]:[0-9]{2}.*(Z|[+-][0-9]{2}(:?[0-9]{2})?)$"
 _ISO = re.compile(
@@ -57,6 +58,7 @@ class Calendar:
         cells = plain(times.cast(pa.string()))
         if dates is not None:
             days = plain(dates.cast(pa.string()))
+            days = pc.replace_substring_regex(days, _MIDNIGHT, "")
             cells = pc.binary_join_element_wise(days, cells, " ")
         file_times = pc.match_substring_regex(cells, _FILE_TIME)
         if pc.any(file_times).as_py():

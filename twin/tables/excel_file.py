@@ -84,7 +84,8 @@ class ExcelFile:
                     text = f"{self._path}: no sheet is called {sheet!r}"
                     raise SourceError(text, known_names(sheet, names))
                 if len(names) > 1 and not self._settings.sheet:
-                    notes.append(f"sheet {sheet!r} is read; another is chosen by sheet of [import]")
+                    others = " or ".join(repr(name) for name in names if name != sheet)
+                    notes.append(f"sheet {sheet!r} is read; sheet of [import] chooses {others}")
                 yield enumerate(book[sheet].iter_rows(values_only=True), 1)
             finally:
                 book.close()

@@ -1,5 +1,6 @@
 """Match the columns of a file to the known columns."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -7,7 +8,7 @@ from difflib import get_close_matches
 from twin.errors import ConfigError, SourceError
 from twin.signals import MBAR, SL_MIN, ZERO_C, Command, Reported
 from twin.tables.likely import as_toml, likely_columns
-from twin.tables.settings import Column, ColumnSource, ImportSettings
+from twin.tables.settings import Column, ColumnSource, ImportSettings, toml_string
 from twin.tables.units import PRESSURES, SUPPLIES, Meaning, find_meaning
 
 DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
@@ -29,6 +30,7 @@ ONE_OF_THEM = (
     (Column.REPORTED_NOZZLE, Column.REPORTED_AIR_SAVING),
     tuple(SUPPLIES),
 )
+_SIGNAL = re.compile(r"[\[(]\s*(mA|V)\s*[\])]\s*$")
 _REQUIRED = (TIMES, tuple(PRESSURES))
 _MEASURED = (*PRESSURES, *SUPPLIES, *BESIDE)  # whose numbers may be scaled
 
@@ -141,8 +143,11 @@ def _require_one(
     if not present:
         error = _missing(f"no column {' or '.join(names)}", names[0], header, location)
         likely = likely_columns(header, file_names.values())
-        if likely:
-            error.hint += f"; by their names these may be:\n  [import.columns]\n{as_toml(likely)}"
+        lines = f"\n{as_toml(likely)}" if likely else ""
+        if not {*likely, *file_names}.intersection(PRESSURES):
+            lines += _signal_line(header)
+        if lines:
+            error.hint += f"; by their names these may be:\n  [import.columns]{lines}"
         raise error
     if len(present) > 1:
         raise _too_many(
@@ -159,11 +164,26 @@ def _missing(
     nearest = get_close_matches(requested, header, n=1) if requested else []
     if nearest:
         hint = f"did you mean {nearest[0]!r}? {hint}"
+    if name in TIMES:
+        hint += ", or time_ms, time_us, time_ns by its unit; time, if it is a date or a time of day"
     if name is Column.BLOW_OFF:
         hint += "; if the ejector has none, say no_blow_off = true under [import]"
     if name in COMMANDS:
         hint += "; if nobody recorded it, twin import --derive-commands finds it from the pressure"
     return SourceError(f"{location}: {problem}; the columns are {listing}", hint)
+
+
+def _signal_line(header: Sequence[str]) -> str:
+    """A line of ``[import.columns]`` for a transmitter's signal; empty if no name has its unit."""
+    signal = next(filter(None, map(_SIGNAL.search, header)), None)
+    if signal is None:
+        return ""
+    numbers = "[0, 10]" if signal[1] == "V" else "[4, 20]"
+    return (
+        f"\n  pressure = {{ name = {toml_string(signal.string)}, signal = {numbers},"
+        ' range = [0, -1000], unit = "mbar", reference = "gauge" }'
+        "   # put in the pressures that these two numbers mean"
+    )
 
 
 def _too_many(problem: str, location: str) -> SourceError:

@@ -14,7 +14,9 @@ _TIME_UNITS = {
 }
 _TIME_UNIT = re.compile(r"[\[(]\s*(s|ms|us|µs|ns)\s*[\])]\s*$")
 _TIME = re.compile(r"time|zeit", re.IGNORECASE)
-_INSTANT = re.compile(r"timestamp|date|datum|uhrzeit", re.IGNORECASE)
+_INSTANT = re.compile(r"timestamp|zeitstempel|date|datum|uhrzeit", re.IGNORECASE)
+_DATE = re.compile(r"\s*(date|datum)\s*", re.IGNORECASE)
+_TIME_OF_DAY = re.compile(r"\s*(time|zeit|uhrzeit|time of day)\s*", re.IGNORECASE)
 _WORDS = {  # in order: a word of suction may stand in the name of a vacuum's block
     Column.BLOW_OFF: re.compile(r"blow|abblas|ausblas|abwurf|abwerf", re.IGNORECASE),
     Column.VACUUM: re.compile(r"vacuum|vakuum|unterdruck", re.IGNORECASE),
@@ -28,9 +30,10 @@ def likely_columns(header: Sequence[str], taken: Collection[str] = ()) -> Mappin
 
     Only one of vacuum and pressure is given, and no time whose unit the name does not have.
     """
-    likely: dict[Column, str] = {}
-    for name in header:
-        column = None if name in taken else _likely(name)
+    free = [name for name in header if name not in taken]
+    likely: dict[Column, str] = dict(_date_and_time(free))
+    for name in free:
+        column = _likely(name)
         if column is not None:
             likely.setdefault(column, name)
     if Column.VACUUM in likely:
@@ -39,7 +42,18 @@ def likely_columns(header: Sequence[str], taken: Collection[str] = ()) -> Mappin
     for column in dict.fromkeys(times[1:]):
         if column != times[0]:
             likely.pop(column, None)
+    if Column.TIME not in likely:
+        likely.pop(Column.DATE, None)
     return likely
+
+
+def _date_and_time(names: Sequence[str]) -> Mapping[Column, str]:
+    """The two columns of a date and a time of day; nothing if one is lacking."""
+    date = next((name for name in names if _DATE.fullmatch(name)), None)
+    time = next((name for name in names if _TIME_OF_DAY.fullmatch(name)), None)
+    if date is None or time is None:
+        return {}
+    return {Column.DATE: date, Column.TIME: time}
 
 
 def _likely(name: str) -> Column | None:

@@ -167,5 +167,9 @@ def open_table(
         hint = f"{suffixes} files can be read" + (f"; {advice}" if advice else "")
         raise ConfigError(f"{path}: cannot tell what it is", hint)
     file = kind(path, settings)
-    layout = find_layout(file.names, settings, file.location, derive=derive)
+    try:
+        layout = find_layout(file.names, settings, file.location, derive=derive)
+    except SourceError as error:  # another sheet or encoding may have the column
+        error.hint = "\n  ".join((*file.notes, error.hint))
+        raise
     return Table(path, layout, settings, ambient, file)
