@@ -94,7 +94,10 @@ def test_what_cannot_be_served_is_said(
         ([], "no ejector to show"),
         (["--config", path, "--certificate", pem], "belong together"),
         (["--config", path, "--certificate", pem, "--key", pem], "cannot be used"),
-        (["--config", rigs.path_of("gripper")], "put keep = true under [alarms]"),
+        (
+            ["--config", rigs.path_of("gripper")],
+            "put keep = true under [alarms] and [page] and start twin run again",
+        ),
     ):
         assert twin(monkeypatch, "serve", "--port", "0", *options) == 2
         assert why in capsys.readouterr().err

@@ -75,7 +75,14 @@ def _may_repeat(option: Any) -> bool:
 
 
 class _Command(_Common, TyperCommand):
-    pass
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As above; a configuration in place of an argument gets the option that takes it."""
+        _, extra, _ = self.make_parser(ctx).parse_args(args=list(args))
+        takes_config = any("--config" in option.opts for option in self.params)
+        configs = [name for name in extra if name.endswith(".toml")] if takes_config else []
+        if configs:
+            ctx.fail(f"Got unexpected extra argument ({configs[0]}). Say: --config {configs[0]}")
+        return super().parse_args(ctx, args)
 
 
 class _Group(_Common, TyperGroup):

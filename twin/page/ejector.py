@@ -63,12 +63,13 @@ class Ejector:
             "alarms": document.section(AlarmSettings, "alarms").keep,
             "page": document.section(PageSettings, "page").keep,
         }
-        for name, is_kept in settings.items():
-            if not is_kept:
-                raise ConfigError(
-                    f"{document.name}: twin run keeps nothing for its page under [{name}]",
-                    f"put keep = true under [{name}] and start twin run again",
-                )
+        lacking = [f"[{name}]" for name, is_kept in settings.items() if not is_kept]
+        if lacking:
+            tables = " and ".join(lacking)
+            raise ConfigError(
+                f"{document.name}: twin run keeps nothing for its page under {tables}",
+                f"put keep = true under {tables} and start twin run again",
+            )
         self.config, self._clock = config, clock
         self.name = config.asset.id or config.asset.type
         self._rules = board_rules(document)
