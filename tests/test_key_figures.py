@@ -708,3 +708,8 @@ def test_the_page_has_the_tables_and_every_key() -> None:
 def test_the_supply_range_is_one() -> None:
     with pytest.raises(ValueError, match="supply_low_bar must be below"):
         FigureSettings(supply_low_bar=6.0, supply_high_bar=5.0)
+
+
+def test_a_title_for_people_does_not_call_h1_the_hysteresis() -> None:
+    assert FIGURES["h1_not_reached"].title == "H1 not reached"
+    assert FIGURES["free_flow"].title == "free flow"

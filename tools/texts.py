@@ -79,7 +79,7 @@ def _in_tables() -> Iterator[Text]:
         if not cause_of(rule.value):
             yield "twin/alarms/default_rules.toml", light.spelt(rule.name)
     for figure in FIGURES.values():
-        yield "twin/figures/key_figures.py", figure.name.replace("_", " ")
+        yield "twin/figures/key_figures.py", figure.title
         yield "twin/figures/key_figures.py", figure.what
     yield "twin/monitor/healthy.py", NOT_COMMISSIONED
     yield "twin/alarms/advice.py", COMMISSION

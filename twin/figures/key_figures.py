@@ -52,6 +52,11 @@ class Figure:
     what: str
     of: Of
 
+    @property
+    def title(self) -> str:
+        """The name for people. H1 keeps its capital: h1 is the hysteresis."""
+        return self.name.replace("_", " ").replace("h1", "H1")
+
 
 def t0(findings: CycleFindings, _unit: Unit) -> float:
     """Evacuation time to H2 (ms)."""

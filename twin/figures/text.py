@@ -116,7 +116,7 @@ def limit_of(name: str, limits: Limits) -> float | None:
 
 def title_of(name: str) -> str:
     """The name of a figure for people."""
-    return tr(name.replace("_", " "))
+    return tr(FIGURES[name].title)
 
 
 def in_words(figure: Figure, trend: Trend, now_ns: int) -> str:
