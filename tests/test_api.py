@@ -366,6 +366,17 @@ def test_a_summary_says_what_matters(tutorial: Read, here: Path) -> None:
         assert text in answer
 
 
+def test_a_result_is_named_in_a_line(
+    tutorial: Read, evil: dict[str, Any], here: Path
+) -> None:
+    names = tutorial.names
+    assert repr(names["answer"]) == "<Answer explained: leakage>"
+    assert repr(names["calibrated"]) == "<Calibrated compact-ejector-35 cell-3: good>"
+    assert repr(commissioned(tutorial)) == "<Commissioned compact-ejector-35 cell-3: good>"
+    conclusion = evil["comparison"].conclusion
+    assert repr(evil["comparison"]) == f"<Compared: {conclusion}>"
+
+
 def test_a_log_without_rows_has_a_summary(tutorial: Read, monkeypatch: pytest.MonkeyPatch) -> None:
     log = tutorial.names["healthy"]
     monkeypatch.setattr(type(log), "_rows", lambda _: iter(()))

@@ -217,6 +217,9 @@ class Calibrated:
     _calibration: Calibration = field(repr=False)
     _log: Log = field(repr=False)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {_name(self.config)}: {self.verdict}>"
+
     def __str__(self) -> str:
         return calibration_report.in_words(self._calibration)
 
@@ -266,7 +269,7 @@ class Calibrated:
         return joined(np.empty(0, SAMPLE), *self._log._samples())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Commissioned(Calibrated):
     """The data set fitted to a unit that nobody has seen before, with the verdict on the fit."""
 
@@ -327,6 +330,9 @@ class Compared:
 
     _comparison: Comparison = field(repr=False)
 
+    def __repr__(self) -> str:
+        return f"<Compared: {self.conclusion}>"
+
     def __str__(self) -> str:
         return compare_text.in_words(self._comparison)
 
@@ -356,6 +362,10 @@ class Answer:
     """
 
     _diagnosis: Diagnosis = field(repr=False)
+
+    def __repr__(self) -> str:
+        causes = ", ".join(cause["effect"] for cause in self.causes)
+        return f"<Answer {self.verdict}{causes and ': '}{causes}>"
 
     def __str__(self) -> str:
         return diagnosis_report.in_words(self._diagnosis)
