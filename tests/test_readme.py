@@ -33,3 +33,9 @@ def test_every_command_is_described_and_every_described_command_exists() -> None
 def test_links_lead_somewhere() -> None:
     for link in re.findall(r"\]\(([^)#]+)\)", README):
         assert (ROOT / link).exists(), link
+
+
+def test_the_first_commands_need_no_more_than_make_demo_installs() -> None:
+    commands = README.partition("## Using it")[2].split("```")[1]
+    assert "twin run" in commands
+    assert not re.search(r"--view|--rrd|twin serve|--aasx", commands)
