@@ -85,9 +85,9 @@ def check_one_group(cycles: Cycles) -> None:
         if step > LEAST_PARTED**2 and explained_sum > PARTED * total:
             usual = np.sqrt((total - explained_sum) / len(compared)) / MBAR
             raise ConfigError(
-                f"with cycle {first + 2} of the record all changes, by {np.sqrt(step) / MBAR:.1f}"
-                f" mbar rms, where cycles otherwise differ by {usual:.1f}: it is of two units, or"
-                " something was changed in the midst of it",
+                f"from cycle {first + 2} on the record is another, by {np.sqrt(step) / MBAR:.1f}"
+                f" mbar rms, and other cycles differ by {usual:.1f}: it is of two units, or"
+                " something was changed during it",
                 "commission on a record of one healthy unit in one state",
             )
 

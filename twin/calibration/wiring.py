@@ -116,7 +116,8 @@ def _refuse_missing_blow_off(samples: Samples) -> None:
     if idles and np.median([_delay_ratio(idle) for idle in idles]) > HELD:
         raise ConfigError(
             f"after suction the pressure holds, then rises by {np.median(rises) / MBAR:.0f} mbar at"
-            " once, and no row has blow-off commanded: something lets air in that is not told",
+            " once, and no row has blow-off commanded: something lets air in that the record does"
+            " not have",
             "connect [driver.tags.blow_off], or the column blow_off, and record again",
         )
 

@@ -172,10 +172,10 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     " are swapped",
     "swap [driver.tags.suction] and [driver.tags.blow_off], or the two columns",
     "after suction the pressure holds, then rises by {rise} mbar at once, and no row has blow-off"
-    " commanded: something lets air in that is not told",
+    " commanded: something lets air in that the record does not have",
     "connect [driver.tags.blow_off], or the column blow_off, and record again",
-    "with cycle {cycle} of the record all changes, by {step} mbar rms, where cycles otherwise"
-    " differ by {usual}: it is of two units, or something was changed in the midst of it",
+    "from cycle {cycle} on the record is another, by {step} mbar rms, and other cycles differ by"
+    " {usual}: it is of two units, or something was changed during it",
     "commission on a record of one healthy unit in one state",
     "the pressure is saturated, stale or bad in {share}% of the samples",
     "check the sensor's range and wiring, then record again",
