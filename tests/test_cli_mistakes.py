@@ -245,6 +245,8 @@ def test_a_mistake_is_said_and_ends_as_the_contract_has_it(
         (("plc", CONFIG, "--duration", "0"), "0 is not a finite number above 0"),
         (("run", CONFIG, "--duration", "0"), "0 is not a finite number above 0"),
         (("run", CONFIG, "--once", "--id", "rig-0l"), "did you mean 'rig-01'?"),
+        (("diagnos", "log.mcap"), "Did you mean diagnose?"),
+        (("alarms", "aknowledge", "plc_stale"), "Did you mean acknowledge?"),
         (("serve", CONFIG), f"Say: --config {CONFIG}"),
         (("alarms", "list", "cell.toml"), "Say: --config cell.toml"),
     ],

@@ -5,6 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -92,6 +93,10 @@ class _Group(_Common, TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in self.instead:
             ctx.fail(f"No such command '{args[0]}'. There is: {self.instead[args[0]]}")
+        if args and self.get_command(ctx, args[0]) is None:
+            likely = get_close_matches(args[0], self.list_commands(ctx), n=1)
+            if likely:
+                ctx.fail(f"No such command '{args[0]}'. Did you mean {likely[0]}?")
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: Any) -> list[str]:
