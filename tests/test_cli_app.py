@@ -1,5 +1,6 @@
 """What all commands have in common: help that says what was written, ``-h`` and ``--version``."""
 
+import io
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from command_line import twin
 from terminal import Program
 from typer.main import get_command
 
+from twin.cli.console import progress
 from twin.cli.main import BEGIN, INSTEAD, ORDER, app
 from twin.cli.run import _hinted
 
@@ -120,3 +122,17 @@ def test_no_value_is_dropped_without_a_word(
     twice = ("--config", "a.toml", "--config", "b.toml")
     assert twin(monkeypatch, "alarms", "history", *twice) == 2
     assert "--config is given twice, and only one can be used" in capsys.readouterr().err
+
+
+class Screen(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_counts_rows_where_the_total_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Screen()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    assert len(list(progress(["x" * 1000, "y" * 500], "reading"))) == 2
+    assert "reading: 1,500 rows" in screen.getvalue()
+    assert "?" not in screen.getvalue().replace("\x1b[?25", "")  # which hides the cursor

@@ -125,11 +125,12 @@ def progress(
         yield from source
         return
     from rich.console import Console as Terminal
-    from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), MofNCompleteColumn())
+    count = TextColumn("{task.description}: {task.completed:,.0f} rows,")
+    columns = (SpinnerColumn(), count, TimeElapsedColumn())
     with Progress(*columns, console=Terminal(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"{label} (samples)", total=None)
+        task = progress.add_task(label, total=None)
         for block in source:
             progress.advance(task, samples(block))
             yield block
