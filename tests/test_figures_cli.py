@@ -144,7 +144,7 @@ def test_a_limit_too_far_to_be_dated_is_drawn_all_the_same(figures: Run, tmp_pat
 
 def test_a_picture_is_of_one_figure_and_there_must_be_such(figures: Run) -> None:
     fill(10, 100)
-    with pytest.raises(ConfigError, match="--picture draws one figure"):
+    with pytest.raises(ConfigError, match="a picture shows one figure"):
         figures("trend", "--picture", "t.png")
     with pytest.raises(ConfigError, match="no figure is called leak"):
         figures("trend", "leak")

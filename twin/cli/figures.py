@@ -481,5 +481,5 @@ def _chosen_figures(names: list[str] | None, picture: Path | None) -> "list[Figu
             f"no figure is called {', '.join(unknown)}", f"there are: {', '.join(FIGURES)}"
         )
     if picture is not None and len(names or []) != 1:
-        raise ConfigError("--picture draws one figure", "name one: twin figures trend leakage")
+        raise ConfigError("a picture shows one figure", "name one: twin figures trend leakage")
     return [FIGURES[name] for name in names or FIGURES]
