@@ -246,9 +246,13 @@ def test_columns_are_what_was_recorded(commanded: Path) -> None:
 @pytest.mark.usefixtures("here")
 def test_a_frame_has_the_columns(tutorial: Read) -> None:
     frame, rows = tutorial.names["frame"], tutorial.names["healthy"].columns()
-    assert list(frame) == list(rows)
+    assert list(frame) == [*rows, *rows.FIELD]
     for name, column in rows.items():
         assert np.array_equal(frame[name], column, equal_nan=column.dtype.kind == "f"), name
+    assert np.array_equal(frame["vacuum_mbar"], rows.vacuum_mbar)
+    deviation = frame["expected_vacuum_mbar"] - frame["vacuum_mbar"]
+    assert np.allclose(frame["deviation_mbar"], deviation, atol=1e-9, equal_nan=True)
+    assert "vacuum_mbar" in simulated(tutorial.names["healthy"].config).frame()
 
 
 def test_without_pandas_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -366,9 +370,7 @@ def test_a_summary_says_what_matters(tutorial: Read, here: Path) -> None:
         assert text in answer
 
 
-def test_a_result_is_named_in_a_line(
-    tutorial: Read, evil: dict[str, Any], here: Path
-) -> None:
+def test_a_result_is_named_in_a_line(tutorial: Read, evil: dict[str, Any], here: Path) -> None:
     names = tutorial.names
     assert repr(names["answer"]) == "<Answer explained: leakage>"
     assert repr(names["calibrated"]) == "<Calibrated compact-ejector-35 cell-3: good>"

@@ -144,10 +144,8 @@ class Log:
         return Compared(compare_sides(ours, theirs))
 
     def frame(self) -> Any:
-        """The columns as a ``pandas.DataFrame``."""
-        from pandas import DataFrame  # noqa: PLC0415  (it takes its time)
-
-        return DataFrame(dict(self.columns()))
+        """The columns as a ``pandas.DataFrame``, with those in mbar and ms beside them."""
+        return self.columns().frame()
 
     def cycles(self) -> list[dict[str, Any]]:
         """Key figures of every cycle, measured and expected, in the field's units.

@@ -22,7 +22,10 @@ class Columns(dict[str, npt.NDArray[Any]]):
     """One array for each column, in SI units; the properties have the field's units.
 
     ``ambient_pa`` is the pressure from which vacuum counts. ``title`` names the rows to people.
+    ``FIELD`` names the properties that ``frame`` adds as columns.
     """
+
+    FIELD: tuple[str, ...] = ("time_ms", "pressure_mbar", "vacuum_mbar")
 
     def __init__(
         self, columns: Mapping[str, npt.NDArray[Any]], ambient_pa: float, title: str
@@ -63,6 +66,12 @@ class Columns(dict[str, npt.NDArray[Any]]):
         return type(self)(
             {name: column[inside] for name, column in self.items()}, self.ambient_pa, self.title
         )
+
+    def frame(self) -> Any:
+        """As a ``pandas.DataFrame``: the columns in SI units, and the properties in the field's."""
+        from pandas import DataFrame  # noqa: PLC0415  (it takes its time)
+
+        return DataFrame({**self, **{name: getattr(self, name) for name in self.FIELD}})
 
     def plot(self, begin_s: float = 0.0, end_s: float = math.inf) -> Picture:
         """Draw the vacuum (mbar) over a range of time (s), with what else there is to compare."""
@@ -114,6 +123,8 @@ class Columns(dict[str, npt.NDArray[Any]]):
 
 class LogColumns(Columns):
     """Rows of a log: measured and expected."""
+
+    FIELD = (*Columns.FIELD, "expected_vacuum_mbar", "deviation_mbar", "supply_bar")
 
     @property
     def expected_vacuum_mbar(self) -> Floats:
