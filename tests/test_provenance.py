@@ -145,6 +145,7 @@ NEEDS_EXTRA = {
     "drivers/plc/opcua": "opcua",
     "twin/alarms/export.py": "tables",
     "twin/api.py": "notebook",
+    "twin/columns.py": "notebook",
     "twin/compare/picture.py": "reports",
     "twin/diagnosis/": "reports",
     "twin/exchange/aas.py": "aas",
