@@ -234,7 +234,8 @@ def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
     config.write_text(config.read_text() + COLUMNS)
     shown = typed(tmp_path, "import", "Messung.xlsx", "--config", config, "--dry-run")
     assert "600 rows, 5.990 s, every 10 ms" in shown
-    typed(tmp_path, "import", "Messung.xlsx", "--config", config, "-o", "Messung.mcap")
+    done = typed(tmp_path, "import", "Messung.xlsx", "--config", config, "-o", "Messung.mcap")
+    assert "Messung.mcap is written; next: twin diagnose Messung.mcap" in done
     figures = typed(tmp_path, "figures", "show", "Messung.mcap")
     assert "t0" in figures
     assert typed(tmp_path, "log", "check", "Messung.mcap")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.app import say_if_cut
-from twin.cli.console import Console, progress, rows_progress
+from twin.cli.console import Console, complain, hint, progress, rows_progress
 from twin.cli.options import AssetsUrl, Force, LogFile, UnitId
 from twin.cli.options import output as output_option
 from twin.cli.setup import configured, pair_of
@@ -105,6 +105,8 @@ def import_(
         sinks = open_sinks({"log": partial(Recorder, draft, header), "console": Console})
         blocks = until(stopped, progress(table.blocks(), "importing"))
         run_loop(blocks, twin, monitor, [*sinks.values()])
+    command = "twin figures show" if table.commands else "twin diagnose"
+    hint(complain, f"{output} is written; next: {command} {output}")
     return leave(interrupted=stopped() == "interrupted")
 
 
