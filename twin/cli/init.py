@@ -45,8 +45,8 @@ GUESSED = {"hose_mm": 1000.0, "diameter_mm": 6.0, "cups": 50.0, "vessel": 750.0}
 
 # Optional signals of the same PLC, as comments in the file that are ready for use.
 OFFERED = """\
-# Each of these that is there narrows what is open: docs/reported-signals.md. Of nozzle
-# (1: it is on) and air saving (1: it is off) take one. A second pressure is at the other end.
+# Optional signals; each makes the fit more certain (docs/reported-signals.md). Use nozzle (1: it
+# blows) or air_saving (1: it does not), not both. pressure_2 is measured at the other end.
 """
 BESIDE_RING = """\
 # nozzle = { address = "30005", bit = 2 }
@@ -493,8 +493,8 @@ def configuration(
     lines = [
         f"#:schema ./{SCHEMA}",
         f"# An editor then completes and checks keys: twin config schema > {SCHEMA}",
-        "# What a person knows of this ejector. What a calibration finds does not",
-        "# stand here but in the asset database. Every key of [data]: docs/data-set.md",
+        "# What a person knows of this ejector. What a calibration finds is kept in the asset",
+        "# database, not here. docs/data-set.md has every key of [data].",
         f"# Next: {first}; then {second}",
         *(
             f"# {line}"
@@ -508,13 +508,13 @@ def configuration(
         "",
         *(_no_driver(sensor) if connection is None else _driver(connection, sensor)),
         "",
-        "# --- what hangs on the ejector, outwards from its port; a fifth off is near enough -----",
+        "# --- what hangs on the ejector, outwards from its port; 20 % off is near enough --------",
         "",
         *_system(system),
         "",
         *_supply(system.supply_bar),
         "",
-        "# twin commission finds the rest. Known for sure may be:",
+        "# twin commission finds the rest. If you are sure of these, set them:",
         "# [data.ejector]",
         "# h1_mbar = 750.0               # vacuum at which air saving ends suction",
         '# control_sensor = "plc"        # it switches by the sensor that the PLC reads (IO-Link)',
@@ -626,7 +626,7 @@ def _system(system: System) -> list[str]:
 def _exactness(system: System) -> str:
     """The line on how exact volumes are that were read off, or guessed."""
     if system.volume_ml is None:
-        within, remark = A_VESSEL_GUESSED, "flows and volumes are guesses, their ratios are not"
+        within, remark = A_VESSEL_GUESSED, "guessed: only ratios of flows and volumes are found"
     else:
         remark = "flows and volumes found are as exact; 1.02 if measured"
         within = A_FIFTH_OFF
