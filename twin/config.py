@@ -328,7 +328,7 @@ def _refuse_calibrated(document: Document) -> None:
     monitor = document.tables.get("monitor", {})
     if isinstance(monitor, Mapping) and "healthy" in monitor:
         raise ConfigError(
-            f"{document.name}: [monitor.healthy]: what a calibration found stands in the asset"
+            f"{document.name}: [monitor.healthy]: what a calibration found is in the asset"
             " database, not in a configuration",
             "remove the table; twin commission and twin calibrate store it",
         )

@@ -38,7 +38,7 @@ class Secret(Settings):
     def _not_itself(cls, given: Any) -> Any:
         if isinstance(given, str):
             raise ValueError(
-                f"a secret does not stand in a configuration, which is copied into logs: {INSTEAD}"
+                f"a secret does not belong in a configuration, which is copied into logs: {INSTEAD}"
             )
         return given
 
@@ -83,7 +83,7 @@ def refuse_password(url: str, instead: str) -> None:
     keys = {key.lower() for key, _ in parse_qsl(parts.query, keep_blank_values=True)}
     if password is not None or keys & {"password", "sslpassword"}:
         raise ValueError(
-            f"a password does not stand in a URL, which is logged and shown: {instead}"
+            f"a password does not belong in a URL, which is logged and shown: {instead}"
         )
 
 
@@ -93,7 +93,7 @@ def refuse_secrets(url: str) -> None:
     has_token = any(_TOKEN.fullmatch(part) for part in parts.path.split("/"))
     if parts.username is not None or parts.query or parts.fragment or has_token:
         raise ValueError(
-            "what looks like a secret does not stand in an address, which is copied into logs:"
+            "what looks like a secret does not belong in an address, which is copied into logs:"
             f" url = {INSTEAD} keeps all of it elsewhere; a password goes into headers"
         )
 

@@ -362,7 +362,7 @@ class OpcuaClient:
             if code & SEVERITY:
                 raise SourceError(
                     f"{self._settings.where}: {node} cannot be written ({status_name(code)})",
-                    "may this user write it? Only what stands under [hil.tags] is written",
+                    "may this user write it? Only the tags of [hil.tags] are written",
                 )
 
     async def _write(self, nodes: tuple[Node, ...], variants: list[ua.Variant]) -> list[int]:
