@@ -124,7 +124,11 @@ def _settings(
     document: Document, kind: type[AnyDriver], origin: str, address: str
 ) -> DriverSettings:
     if "driver" not in document.tables:
-        raise ConfigError(f"{document.name}: there is no [driver] table", "say where the PLC is")
+        raise ConfigError(
+            f"{document.name}: there is no [driver] table",
+            'say where the PLC is, such as kind = "modbus" and host = "192.168.0.10";'
+            " twin init writes a whole configuration",
+        )
     folder = Path(document.name).parent  # files lie there, wherever the program was started
     with installed.naming(origin, ConfigError):
         settings = document.section(kind.settings_class, "driver").below(folder)
