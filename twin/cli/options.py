@@ -95,7 +95,9 @@ def chosen(output: Path | None, option: str, named: Path | None, *endings: str) 
     if output is None or output.suffix.lower() not in endings:
         return named
     if named is not None:
-        raise ConfigError(f"-o {output} and {option} {named} write the same", "leave one of them out")
+        raise ConfigError(
+            f"-o {output} and {option} {named} write the same", "leave one of them out"
+        )
     return output
 
 
