@@ -490,6 +490,18 @@ def test_a_column_that_another_sheet_may_have(tmp_path: Path) -> None:
     assert "sheet 'Sheet' is read; sheet of [import] chooses 'Notes'" in caught.value.hint
 
 
+def test_numbers_that_were_pasted_as_text_have_decimal_commas(tmp_path: Path) -> None:
+    path = workbook(
+        tmp_path / "t.xlsx",
+        ["time_ms", "suction", "blow_off", "pressure_mbar"],
+        ["0", "FALSCH", "0", "1013,2"],
+        ["0,5", "WAHR", "0", "999"],
+    )
+    rows = taken(path, settings({}))
+    assert rows["time_ns"].tolist() == [0, 500_000]
+    assert rows["pressure"].tolist() == pytest.approx([101_320.0, 99_900.0])
+
+
 def test_date_and_time_in_cells_of_their_own(tmp_path: Path) -> None:
     path = workbook(
         tmp_path / "t.xlsx",

@@ -1,5 +1,6 @@
 """A sheet of an Excel file as batches of text."""
 
+import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,7 @@ from twin.tables.settings import Column, ImportSettings
 from twin.tables.table_to_samples import Batch
 
 _ROWS = 10_000
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+")  # of a number that was pasted as text
 _PREAMBLE = 200  # rows that may stand before the header
 
 Cells = tuple[Any, ...]
@@ -111,11 +113,14 @@ def _has_value(cells: Cells) -> bool:
 
 
 def _text(cell: Any) -> str:
-    """A cell as text, as in CSV; dates as ISO 8601."""
+    """A cell as text, as in CSV with decimal points; dates as ISO 8601."""
     if cell is None:
         return ""
     if isinstance(cell, datetime):
         return cell.isoformat(" ")
     if isinstance(cell, date | time):
         return cell.isoformat()
-    return repr(cell) if isinstance(cell, float) else str(cell).strip()
+    if isinstance(cell, float):
+        return repr(cell)
+    text = str(cell).strip()
+    return text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text
