@@ -144,7 +144,7 @@ def test_without_a_run_the_next_one_does_it(
     begun(tmp_path / "alarms.sqlite").close()
     assert "unacknowledged" in run("list")
     said = run("acknowledge", LEAK)
-    assert said == f"{LEAK}: asked; twin run will do it when it is there again\n"
+    assert said == f"{LEAK}: requested; waits for the next twin run\n"
     run("unshelve", "plc_stale")
     alarm_writer = AlarmWriter(lambda: open_store("alarms.sqlite"), UNIT, pytest.fail)
     alarms = Alarms(board_rules(None), lambda: APART + 9 * S, alarm_writer.begin(), alarm_writer)

@@ -438,7 +438,7 @@ def _await_answer(store: "Store", number: int, name: str, action: "AlarmAction")
     end = time.monotonic() + ANSWER_S
     while (answer := store.answer(number)) is None:
         if time.monotonic() > end:
-            print(f"{name}: asked; twin run will do it when it is there again")
+            print(f"{name}: requested; waits for the next twin run")
             return ""
         time.sleep(LOOK_S)
     if not answer:
