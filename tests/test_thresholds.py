@@ -8,7 +8,7 @@ import pytest
 import rigs
 from calibrations import quiet, typed
 
-from twin.calibration.commission import commission, guessed, switching_as
+from twin.calibration.commission import _shown, commission, guessed, switching_as
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted
 from twin.calibration.parameters import Free
@@ -19,6 +19,7 @@ from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.parts import Cups, Tube
 from twin.monitor.detector_window import detector_of
+from twin.monitor.healthy import Scatter
 from twin.monitor.switching_detector import PhaseFinder
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples
 
@@ -177,4 +178,9 @@ def test_a_turn_by_a_wave_in_the_hose_is_no_threshold() -> None:
     assert goes_on.any()
     assert not never_on.switchings[1].any()
     assert np.isfinite(readings.on)
-    assert np.isnan(decided(readings, never_on, coefficients(data)).on)
+    decisions = decided(readings, never_on, coefficients(data))
+    assert np.isnan(decisions.on)
+    seen = Scatter(mean=530.0, sigma=0.6, cycles=10)  # while the twin runs
+    figures = {"h1_level": seen, "h1_low_level": seen}
+    assert _shown(figures, readings) == figures
+    assert [*_shown(figures, decisions)] == ["h1_level"]

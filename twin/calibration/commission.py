@@ -42,9 +42,10 @@ from twin.model.dataset import Ambient, DataSet, coefficients, sensor_place
 from twin.model.effects import standing_for
 from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
-from twin.monitor.cycles import FEWEST_ROWS, Cycle
-from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy
+from twin.monitor.cycles import FEWEST_ROWS
+from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy, Scatter
 from twin.monitor.signal_checks import APART, Contradiction
+from twin.monitor.statistics import LEVELS
 from twin.monitor.surroundings import taken_in
 from twin.signals import (
     MBAR,
@@ -232,7 +233,14 @@ def commission(
     cycles = complete(fitted.data, samples)
     sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     unseen_level = _unseen_level(readings, is_told=hysteresis_is_told)
-    healthy = _healthy(config, fitted, cycles, samples, sigma, unseen_level)
+    healthy = _healthy(
+        config,
+        fitted,
+        _shown(scatter(fitted.data, cycles), readings),
+        samples,
+        sigma,
+        unseen_level,
+    )
     times = samples["host_ns"]
     ends = int(times[0]), int(times[-1])
     calibration = Calibration(fitted, verdict, healthy, len(cycles), *ends)
@@ -253,20 +261,30 @@ def _doubts(config: Config, calibration: Calibration, readings: Readings) -> tup
 def _healthy(
     config: Config,
     fitted: Fitted,
-    cycles: Sequence[Cycle],
+    figures: dict[str, Scatter],
     samples: Samples,
     optimum: float,
     unseen_level: float,
 ) -> Healthy:
-    """The healthy scatter of ``cycles``.
+    """The healthy scatter of a record whose cycles have these ``figures``.
 
     ``optimum`` is one sigma (bar) of the optimum pressure, 0 if it is configured; ``unseen_level``
     one sigma (mbar) of a switching level that no cycle shows.
     """
     untold = {"supply.optimum_bar": optimum} if optimum else {}
     as_fitted = replace(config, data=fitted.data)
-    healthy = like_these(as_fitted, fitted, scatter(fitted.data, cycles), samples, untold)
+    healthy = like_these(as_fitted, fitted, figures, samples, untold)
     return healthy.model_copy(update={"unseen_level_mbar": unseen_level})
+
+
+def _shown(figures: dict[str, Scatter], readings: Readings) -> dict[str, Scatter]:
+    """``figures`` without a level at which the nozzle goes on again that the whole record denies.
+
+    While the twin runs, waves in a hose can look like it.
+    """
+    _, on_level = LEVELS
+    shows_on = np.isfinite(readings.on)
+    return {name: figure for name, figure in figures.items() if shows_on or name != on_level}
 
 
 def _unseen_level(readings: Readings, *, is_told: bool) -> float:
