@@ -75,7 +75,7 @@ coverage: .venv/dev  ## which branches the tests take, also in processes that th
 	$(BIN)/python tools/coverage_table.py coverage.json
 
 clean:  ## take away what was made here
-	rm -rf .venv demo site audit coverage.json .coverage*
+	rm -rf .venv demo site audit coverage.json .coverage* twin/page/node_modules
 
 .venv/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -83,9 +83,11 @@ clean:  ## take away what was made here
 	$(PYTHON) -m venv .venv \
 		|| { echo "Python cannot make a virtual environment; on Debian or Ubuntu: apt install python3-venv"; exit 2; }
 
-.venv/run: .venv/bin/python requirements.lock pyproject.toml
+.venv/run: .venv/bin/python requirements.lock pyproject.toml hatch_build.py twin/page/package-lock.json
 	$(PIP) --require-hashes -r requirements.lock
 	$(PIP) --no-build-isolation --no-deps --editable .
+	@test -d twin/page/node_modules/uplot \
+		|| echo "npm is missing or reached no registry: twin serve does not start, all else does (docs/installation.md)"
 	$(BIN)/python -m compileall -q twin drivers
 	touch $@
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 PEERS = Path(__file__).parent / "peers"  # programs of ours around npm packages and libmodbus
 PATIENCE_S = 60.0
+NPM = ("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund")
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,21 @@ NEEDS: Mapping[str, Need] = {
         ("nodejs", "npm"),
         "OPC UA with a server and clients of other make",
         probe=("node", "-e", "require.resolve('node-opcua-server')"),
-        install=("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"),
+        install=NPM,
     ),
     "axe": Need(
         ("node",),
         ("nodejs", "npm"),
         "whether the page is fit for keyboards and screen readers",
         probe=("node", "-e", "require.resolve('axe-core')"),
-        install=("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"),
+        install=NPM,
+    ),
+    "uplot": Need(
+        ("node", "npm"),
+        ("nodejs", "npm"),
+        "the technician's page with its curves, and the wheel, which has what draws them",
+        probe=("node", "-e", "require.resolve('../../twin/page/node_modules/uplot')"),
+        install=(*NPM, "--omit=dev", "--prefix", "../../twin/page"),
     ),
     "cc": Need(
         ("cc",),

@@ -171,6 +171,7 @@ def test_a_run_beside_a_plc(base: Base, plc: PlcProcess, tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STARTERS)
+@pytest.mark.needs("uplot")
 def test_a_wheel_begins_with_an_example_away_from_a_checkout(name: str, wheel: Base) -> None:
     assert str(rigs.ROOT) not in done(wheel(code="import twin; print(twin.__file__)"))
     assert f"twin plc {name}.toml" in done(wheel("init", f"{name}.toml", "--starter", name))
@@ -201,6 +202,7 @@ def last_received_ns(log: Path) -> int:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+@pytest.mark.needs("uplot")
 def test_on_a_new_machine_the_first_row_of_a_wheel_is_there_at_once(
     wheel: Base, plc: PlcProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ from twin.figures.database import open_store as open_figures
 from twin.instants import DAY_NS, clock
 from twin.page import app as module
 from twin.page.app import COOKIE, STATIC, Access, Page
+from twin.page.chart_library import FILES
 from twin.page.ejector import Ejector
 from twin.page.sessions import SESSION_S, Sessions
 from twin.page.settings import REPORTS, folder_of
@@ -180,6 +181,19 @@ def test_what_the_page_is_made_of_is_here(site: Site) -> None:
     first_view = [site.client.get("/"), *map(site.client.get, ("/api/me", "/api/all"))]
     files = [len(site.client.get(f"/static/{name}").content) for name in STATIC]
     assert sum(files) + sum(len(answer.content) for answer in first_view) < 100_000
+
+
+def test_the_chart_library_is_served_as_the_page_s_own_files_are(tmp_path: Path) -> None:
+    users = quick_users(tmp_path / "users.toml")
+    library = dict.fromkeys(FILES, b"uPlot")
+    page = Page([], authenticator_of(users), Sessions(users), Access(), library=library)
+    client = TestClient(page.app(), OURS)
+    own = client.get("/static/chart.js").headers
+    for name, kind in FILES.items():
+        answer = client.get(f"/static/{name}")
+        assert answer.content == b"uPlot"
+        assert answer.headers["content-type"].startswith(kind)
+        assert answer.headers["cache-control"] == own["cache-control"]
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,10 @@ OURS = ("twin", "drivers", "tests", "tools")
 MADE = {"__pycache__", "node_modules"}
 TINY = 64  # bytes: below, files are alike by chance
 LONGEST = 500  # characters in a line that a person has written
+UPLOT = "twin/page/node_modules/uplot"
+# What a wheel has of it.
+OF_UPLOT = ("LICENSE", "package.json", "dist/uPlot.iife.min.js", "dist/uPlot.min.css")
+OF_SOURCES = {".gitignore", "LICENSE", "PKG-INFO", "README.md", "hatch_build.py", "pyproject.toml"}
 INSTALLED = Path(sysconfig.get_path("purelib"))
 
 
@@ -68,6 +72,12 @@ def test_no_file_is_that_of_an_installed_package() -> None:
     assert copies(our_files(), INSTALLED) == {}
 
 
+@pytest.mark.needs("uplot")
+def test_no_file_is_that_of_an_npm_package() -> None:
+    assert len([*files(ROOT / UPLOT)]) > 5
+    assert copies(our_files(), ROOT / UPLOT) == {}
+
+
 def test_a_copied_file_is_found(tmp_path: Path) -> None:
     """The check above sees what it is to see: a header of FMI, as it once stood in the tree."""
     (copied := tmp_path / "a.h").write_bytes(
@@ -99,18 +109,24 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]
         yield archive
 
 
-def test_a_wheel_has_the_packages_whole_and_one_licence(wheel: zipfile.ZipFile) -> None:
+@pytest.mark.needs("uplot")
+def test_a_wheel_has_the_packages_whole_and_says_the_licence_of_each_part(
+    wheel: zipfile.ZipFile,
+) -> None:
     inside = [*files(ROOT / "twin"), *files(ROOT / "drivers")]
     expected = {file.relative_to(ROOT).as_posix() for file in inside}
     expected |= {f"twin/starters/{file.name}" for file in (ROOT / "configs").glob("*.toml")}
+    expected |= {f"{UPLOT}/{name}" for name in OF_UPLOT}
     shipped = set(wheel.namelist())
     (metadata,) = (name for name in shipped if name.endswith(".dist-info/METADATA"))
     assert {name for name in shipped if ".dist-info/" not in name} == expected
     told = BytesParser().parsebytes(wheel.read(metadata))
-    assert told["License-Expression"] == "Apache-2.0"
-    assert told.get_all("License-File") == ["LICENSE"]
-    text = wheel.read(metadata.replace("METADATA", "licenses/LICENSE"))
-    assert text == (ROOT / "LICENSE").read_bytes()
+    assert told["License-Expression"] == "Apache-2.0 AND MIT"
+    assert told.get_all("License-File") == ["LICENSE", f"{UPLOT}/LICENSE"]
+    for licence, words in (("LICENSE", b"Apache License"), (f"{UPLOT}/LICENSE", b"MIT License")):
+        text = wheel.read(metadata.replace("METADATA", f"licenses/{licence}"))
+        assert text == (ROOT / licence).read_bytes()
+        assert words in text
 
 
 def test_measured_data_says_whose_it_is_and_is_not_distributed() -> None:
@@ -120,6 +136,7 @@ def test_measured_data_says_whose_it_is_and_is_not_distributed() -> None:
         assert row.rstrip(" |").endswith("MIT"), row
 
 
+@pytest.mark.needs("uplot")
 def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
@@ -128,7 +145,8 @@ def test_a_source_distribution_has_what_the_wheel_is_made_of(tmp_path: Path) -> 
         inside = {member.name.split("/", 1)[1] for member in archive if member.isfile()}
     assert "twin/starters/test_rig.toml" in inside
     others = {name for name in inside if not name.startswith(("twin/", "drivers/"))}
-    assert others == {".gitignore", "LICENSE", "README.md", "pyproject.toml", "PKG-INFO"}
+    assert others == OF_SOURCES
+    assert {f"{UPLOT}/{name}" for name in OF_UPLOT} <= inside
 
 
 # --- imports and declarations -------------------------------------------------------------------
@@ -164,6 +182,7 @@ NEEDS_EXTRA = {
 }
 
 NEIGHBOURS = {file.stem for folder in ("tests", "tools") for file in (ROOT / folder).iterdir()}
+NEIGHBOURS.add("hatch_build")
 
 
 def declared(requirements: list[str]) -> set[str]:

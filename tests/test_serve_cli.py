@@ -35,6 +35,7 @@ from twin.page.settings import RING, folder_of
 
 
 @pytest.mark.slow
+@pytest.mark.needs("uplot")
 def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     path = write_config(tmp_path)
     Run(config(path)).close()
@@ -52,6 +53,7 @@ def test_it_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.needs("uplot")
 def test_it_serves_over_tls(tmp_path: Path) -> None:
     path = write_config(tmp_path)
     Run(config(path)).close()
@@ -84,6 +86,7 @@ def test_others_reach_no_page_without_users(
     assert "twin users add NAME" in said
 
 
+@pytest.mark.needs("uplot")
 def test_what_cannot_be_served_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -116,15 +116,17 @@ def _serve(
     from twin.audit import Audit
     from twin.login import Authenticator
     from twin.page.app import Access, Page
+    from twin.page.chart_library import chart_library
     from twin.page.ejector import Ejector
     from twin.page.server import address, listen, make_server
     from twin.page.sessions import Sessions
 
+    library = chart_library()
     host_names = {name.lower() for name in (*names, endpoint.host, socket.gethostname()) if name}
     access = Access(frozenset(host_names), endpoint.scheme == "https", endpoint.is_loopback)
     authenticator = Authenticator(users, Audit(users.path.parent, "page", complain))
     ejectors = [Ejector(config) for config in settings]
-    page = Page(ejectors, authenticator, Sessions(users), access, plant_overview)
+    page = Page(ejectors, authenticator, Sessions(users), access, plant_overview, library)
     server = make_server(page.app(), endpoint)
     with listen(endpoint) as listening:
         print(f"the page is at {address(endpoint, listening)}", flush=True)

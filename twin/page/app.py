@@ -11,7 +11,7 @@ import ipaddress
 import json
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -39,6 +39,7 @@ from twin.instants import DAY_NS
 from twin.languages.catalogues import Catalogues
 from twin.languages.texts import speaking, tr
 from twin.login import Authenticator
+from twin.page.chart_library import FILES
 from twin.page.ejector import Ejector
 from twin.page.plant_overview import PlantOverview
 from twin.page.plant_overview_app import ALL, AllEjectors
@@ -139,7 +140,9 @@ class Page:
         sessions: Sessions,
         access: Access,
         plant: PlantOverview | None = None,
+        library: Mapping[str, bytes] | None = None,
     ) -> None:
+        """``library`` are the files of the chart library; without it no curve is drawn."""
         self.plant = plant
         self.ejectors, self.sessions, self.access = ejectors, sessions, access
         self._authenticator, self.users = authenticator, authenticator.users
@@ -153,6 +156,7 @@ class Page:
         self._curve_lock = asyncio.Lock()
         files = resources.files("twin.page").joinpath("static")
         self._static = {name: files.joinpath(name).read_bytes() for name in STATIC}
+        self._static |= library or {}
         self._pages = {
             name: files.joinpath(name).read_text(encoding="utf-8")
             for name in ("index.html", "all.html", "login.html", "error.html")
@@ -369,7 +373,7 @@ class Page:
         if name not in self._static:
             raise HTTPException(HTTPStatus.NOT_FOUND)
         headers = {"cache-control": "no-cache"}
-        return Response(self._static[name], headers=headers, media_type=STATIC[name])
+        return Response(self._static[name], headers=headers, media_type=(STATIC | FILES)[name])
 
     async def report(self, request: Request) -> Response:
         """The HTML report of a diagnosis."""
