@@ -34,6 +34,7 @@ from twin.notifications.mqtt import Mqtt
 from twin.notifications.settings import MqttSettings
 from twin.page import plant_overview as hall_module
 from twin.page.app import Access, Page
+from twin.page.chart_library import chart_library
 from twin.page.ejector import Ejector
 from twin.page.plant_overview import PlantOverview
 from twin.page.plant_overview_client import listening
@@ -329,7 +330,8 @@ def test_it_is_seen_by_whom_the_other_page_is(tmp_path: Path, told: Told) -> Non
 def site(folder: Path, port: int) -> Iterator[str]:
     users, place, hall = quick_users(folder / "users.toml"), Place("127.0.0.1", 0), PlantOverview()
     inner = make_server(
-        Page([], authenticator_of(users), Sessions(users), Access(), hall).app(), place
+        Page([], authenticator_of(users), Sessions(users), Access(), hall, chart_library()).app(),
+        place,
     )
     wanted = MqttSettings(host="127.0.0.1", port=port)
     with listening(wanted, folder, hall, pytest.fail), listen(place) as socket:
@@ -358,7 +360,7 @@ def publishers(running: Broker, count: int, closing: ExitStack) -> list[Mqtt]:
 
 
 @pytest.mark.slow
-@pytest.mark.needs("mosquitto")
+@pytest.mark.needs("mosquitto", "uplot")
 def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> None:
     leak = Message("1", LEAK, alarm(Unit(TYPE, "cell-17")))
     with ExitStack() as closing:
@@ -407,7 +409,7 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.needs("axe", "mosquitto")
+@pytest.mark.needs("axe", "mosquitto", "uplot")
 def test_axe_finds_no_violation_and_a_german_browser_reads_german(
     tmp_path: Path, browser: Browser
 ) -> None:
@@ -431,7 +433,7 @@ def test_axe_finds_no_violation_and_a_german_browser_reads_german(
 
 
 @pytest.mark.slow
-@pytest.mark.needs("mosquitto")
+@pytest.mark.needs("mosquitto", "uplot")
 def test_it_is_fit_for_gloves_on_every_screen(
     tmp_path: Path,
     browser: Browser,
@@ -462,7 +464,7 @@ def test_it_is_fit_for_gloves_on_every_screen(
 
 
 @pytest.mark.slow
-@pytest.mark.needs("mosquitto")
+@pytest.mark.needs("mosquitto", "uplot")
 def test_twin_run_is_on_the_page_of_twin_serve(tmp_path: Path) -> None:
     """A real PLC's process, the edge's, the broker's and the page's; the edge is killed."""
     tables = tomllib.loads(rigs.path_of("gripper").read_text(encoding="utf-8"))

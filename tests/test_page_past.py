@@ -18,6 +18,7 @@ from twin.page.log_folders import remember
 from twin.page.settings import folder_of
 
 __all__ = ["site"]
+pytestmark = pytest.mark.needs("uplot")
 AGO_S = 1500  # since when the log is
 LOGGED_S = 600.0
 PEAK_MBAR = 950.0

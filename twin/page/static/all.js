@@ -135,9 +135,7 @@ function card(alarm) {
 
 function showPlots() {
   const { time, low, high, expected } = one.rows;
-  const model = { colour: "--orange", width: 2, dash: [8, 5] };
-  draw("one", "mbar", [{ time, low: expected, ...model },
-    { time, low, high, colour: "--blue", width: 2, fill: 0.33 }]);
+  draw("one", "mbar", [{ time, low: expected }, { time, low, high }]);
   const select = $("figure");
   const names = one.trends.map((trend) => trend.name);
   if ([...select.options].map((option) => option.value).join() !== names.join()) {
@@ -148,21 +146,26 @@ function showPlots() {
   const trend = one.trends.find((each) => each.name === select.value);
   $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : t("No cycle has been told yet.");
   const { time: at, measured, expected: beside, unit } = trend || { time: [], measured: [], expected: [], unit: "" };
-  draw("figure", unit, [{ time: at, low: measured, colour: "--grey", dots: true },
-    { time: at, low: beside, ...model }]);
+  draw("figure", unit, [{ time: at, low: measured }, { time: at, low: beside }]);
 }
 
-function draw(name, unit, series) {
+const EXPECTED = { colour: "--orange", width: 2, dash: [8, 5], label: t("expected") };
+const SERIES = {
+  one: [EXPECTED, { colour: "--blue", width: 2, fill: "54", label: t("measured"), isRange: true, order: -1 }],
+  figure: [{ colour: "--grey", dots: true, label: t("measured") }, EXPECTED],
+};
+
+function draw(name, unit, tables) {
   const least = name === "one" ? () => 0 : (low, high) => roomy(low, high)[0];
   if (!plots[name]) {
-    const span = () => moments(plots[name] ? plots[name].series[0].time : []);
-    plots[name] = new Chart($(`${name}-plot`), {
-      home: span, all: span, least: 10, tools: $(`${name}-tools`), ticks: () => dateTicks,
+    const span = () => moments(plots[name] ? plots[name].tables[0].time : []);
+    plots[name] = new Chart($(`${name}-plot`), SERIES[name], {
+      home: span, all: span, least: 10, tools: $(`${name}-tools`), ticks: dates,
       values: (low = 0, high = low + 100) => [least(low, high), roomy(low, high)[1]],
     });
   }
   plots[name].options.unit = unit;
-  plots[name].set(series);
+  plots[name].set(tables);
 }
 
 function moments(times) { // at least a minute, also around one point alone

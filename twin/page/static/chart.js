@@ -1,46 +1,39 @@
-// Curves over time on a canvas: bands, marks, ticks with units, zoom and pan.
+// Curves over time, drawn by uPlot: here is which stretch is shown, and what stands beside the curves.
 "use strict";
 
 const FONT = "15px system-ui, sans-serif";
 const BOTTOM_PX = 26; // room for what stands at the ticks of time
 const SIDE_PX = 28; // half of the widest of them
+const READING_PX = 36; // two lines of the values at the pointer
 const TICK_PX = { time: 90, value: 44 }; // between two ticks, at least
 const ZOOM = 2; // by one press
 const DATES = LANGUAGE === "en" ? "en-GB" : LANGUAGE; // the day before the month, and 24 hours
 const DAY_S = 86400;
 const MONDAY_S = 4 * DAY_S; // the first one after 1970 began
-const STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
-  ...[1, 2, 3, 7, 14, 28, 56].map((days) => days * DAY_S)];
+const STEPS = Array.from({ length: 45 }, (_, i) => Number(`${[1, 2, 5][i % 3]}e${Math.floor(i / 3) - 6}`));
+const DATE_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
+  ...[1, 2, 3, 7, 14, 28, 56, 112, 224].map((days) => days * DAY_S)];
 
-// --- ticks ---------------------------------------------------------------------------------------
+// --- ticks and values ----------------------------------------------------------------------------
 
-function niceStep(least) { // 1, 2 or 5 times a power of ten
-  const power = 10 ** Math.floor(Math.log10(least));
-  return [1, 2, 5, 10].map((times) => times * power).find((step) => step >= least * (1 - 1e-9));
-}
+// Of an axis of time: steps that ticks may have (s), a moment from which they count, and texts.
 
-function multiples(step, low, high) {
-  const count = Math.max(0, Math.floor(high / step + 1e-9) - Math.ceil(low / step - 1e-9) + 1);
-  return Array.from({ length: count }, (_, i) => (Math.ceil(low / step - 1e-9) + i) * step);
-}
+const secondsBefore = (end) => ({
+  steps: STEPS,
+  origin: end,
+  text: (time, step) => `${number(time - end(), digitsOf(step))} s`,
+  exactly: (time) => `${number(time - end(), 2)} s`,
+});
 
-function numberTicks(low, high, most, unit = "") {
-  const step = niceStep((high - low) / Math.max(1, most));
-  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-  return multiples(step, low, high).map((at) => ({ at, text: number(at, digits) + unit }));
-}
-
-function secondTicks(end) { // how long before it
-  return (from, to, most) => numberTicks(from - end, to - end, most, " s")
-    .map(({ at, text }) => ({ at: at + end, text }));
-}
-
-function dateTicks(from, to, most) { // at full hours, days and Mondays of the server's zone
-  const step = STEPS_S.find((one) => (to - from) / one <= most) || STEPS_S[STEPS_S.length - 1];
-  const ahead = (zone === null ? -60 * new Date().getTimezoneOffset() : zone) - MONDAY_S;
-  const ticks = multiples(step, from + ahead, to + ahead).map((at) => at - ahead);
-  return ticks.map((at) => ({ at, text: dateText(at, step) }));
-}
+const dates = { // full hours, days and Mondays of the server's zone
+  steps: DATE_STEPS_S,
+  origin: () => MONDAY_S - (zone === null ? -60 * new Date().getTimezoneOffset() : zone),
+  text: dateText,
+  exactly: (time, width) => there(time).toLocaleString(DATES, {
+    day: "numeric", month: "short", hour: "2-digit", minute: "2-digit", second: "2-digit",
+    ...(width < 60 ? { fractionalSecondDigits: 3 } : {}),
+  }),
+};
 
 function dateText(tick, step) {
   const then = there(tick);
@@ -51,76 +44,68 @@ function dateText(tick, step) {
     : then.toLocaleTimeString(DATES, { hour: "2-digit", minute: "2-digit", ...seconds });
 }
 
+function ticksFrom(origin, step, from, to) {
+  const first = Math.ceil((from - origin) / step - 1e-9);
+  const count = Math.max(0, Math.floor((to - origin) / step + 1e-9) - first + 1);
+  return Array.from({ length: count }, (_, i) => origin + (first + i) * step);
+}
+
+const digitsOf = (step) => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+
 function roomy(low, high) { // a range of values with some room around
   const room = Math.max((high - low) * 0.08, Math.abs(high) * 0.02, 1e-6);
   return [low - room, high + room];
 }
 
-// --- what is to be drawn -------------------------------------------------------------------------
-
-function firstAfter(times, wanted) { // index of the first one that is later; times ascend
-  let [low, high] = [0, times.length];
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle] > wanted) high = middle; else low = middle + 1;
-  }
-  return low;
-}
-
-function part({ time }, from, to) { // indices of what is seen, and one more on each side
-  return [Math.max(0, firstAfter(time, from) - 1), Math.min(time.length, firstAfter(time, to) + 1)];
-}
-
-// Points from low to high: all, or the lowest and highest of each pixel where there are more.
-function decimate({ time, low, high = low }, [first, end], x, pixel) {
-  const points = [];
-  const all = end - first <= 2 * Math.abs(x(time[end - 1]) - x(time[first])) / pixel;
-  let last = null;
-  for (let i = first; i < end; i += 1) {
-    const at = all ? x(time[i]) : Math.round(x(time[i]) / pixel) * pixel;
-    const gap = low[i] === null || high[i] === null;
-    if (gap || all || !last || last.x !== at) points.push({ x: at, low: low[i], high: high[i], gap });
-    else {
-      last.low = Math.min(last.low, low[i]);
-      last.high = Math.max(last.high, high[i]);
-    }
-    last = gap ? null : points[points.length - 1];
-  }
-  return points;
-}
-
-function runs(points) { // between gaps
-  const found = [[]];
-  for (const point of points) {
-    if (point.gap) found.push([]); else found[found.length - 1].push(point);
-  }
-  return found.filter((run) => run.length);
-}
-
 // --- the chart -----------------------------------------------------------------------------------
 
-/* Options. home: () => [from, to] in s, what is shown at first and which end moves on; all: () =>
+const AXIS = {
+  font: FONT, stroke: () => colour("--ink"),
+  grid: { stroke: () => colour("--line"), width: 1 }, ticks: { stroke: () => colour("--line"), width: 1, size: 5 },
+};
+
+function withColumns(series) { // of uPlot's data, whose first one is the time
+  let next = 1;
+  return series.map((one) => {
+    const first = next;
+    next += one.isRange ? 2 : 1;
+    return { ...one, first, last: next - 1 };
+  });
+}
+
+function optionsOf({ colour: name, width = 0, dash = [], dots = false, spanGaps = false }) {
+  return {
+    stroke: () => colour(name), width, dash: dash.map((px) => px * uPlot.pxRatio), spanGaps,
+    points: { show: dots, size: 5, width: 0, fill: () => colour(name) },
+  };
+}
+
+/* Series: [{colour, width, dash, fill, dots, spanGaps, label, order, isRange}], of which uPlot draws two
+   where it is a range from low to high. Fill: the opacity between these as two hexadecimal digits.
+   What has a label is told at the pointer, in order.
+   Options. home: () => [from, to] in s, what is shown at first and which end moves on; all: () =>
    [from, to], as far as it can be seen; least and most: s, the shortest and the longest stretch; values: (low, high) =>
-   [low, high] of the axis, which are undefined where there is nothing; ticks: () => (from, to, most)
-   => [{at, text}]; unit; tools: where buttons go; back: the text of one; bands: (from, to) => [{from,
-   to, colour, text}]; marks: () => [{at, text, colour, dash, from, to}], from and to of when it may
-   have been; moved: called when another stretch is shown; leave: called in place of going home.
-   A series: {time, low, high, colour, width, dash, fill, dots}; high is low if it is not given. */
+   [low, high] of the axis, which are undefined where there is nothing; ticks: those of time; unit;
+   tools: where buttons go; back: the text of one; bands: (from, to) => [{from, to, colour, text}];
+   marks: () => [{at, text, colour, dash, from, to}], from and to of when it may have been; moved:
+   called when another stretch is shown; leave: called in place of going home. */
 class Chart {
-  constructor(box, options) {
+  constructor(box, series, options) {
     this.use(options);
-    this.series = [];
+    this.box = box;
+    this.series = withColumns(series);
+    this.tables = series.map(() => ({ time: [], low: [], high: [] }));
     this.width = this.end = null; // s: what a person has chosen to see
     this.fingers = new Map();
-    this.canvas = element("canvas");
-    this.ctx = this.canvas.getContext("2d");
-    box.replaceChildren(this.canvas);
+    this.reading = element("p", { class: "reading", "aria-hidden": "true" });
+    box.replaceChildren(this.reading);
     box.tabIndex = 0;
+    this.plot = new uPlot(this.layout(), this.columns(), box);
     const press = (text, label, onclick) => element("button", { type: "button", "aria-label": label, onclick }, text);
     this.home = press(this.options.back, this.options.back, () => this.goHome());
     this.options.tools.replaceChildren(this.home,
       press("−", t("Zoom out"), () => this.zoom(ZOOM)), press("+", t("Zoom in"), () => this.zoom(1 / ZOOM)));
-    this.listen(box);
+    this.listen();
     this.moved();
   }
 
@@ -129,25 +114,24 @@ class Chart {
     this.options = { ...common, ...options };
   }
 
-  listen(box) {
-    const { canvas } = this;
-    new ResizeObserver(() => this.draw()).observe(box);
-    addEventListener("resize", () => this.update()); // also where only the size of a pixel changes
+  listen() {
+    const { box, plot: { over } } = this;
+    new ResizeObserver(() => this.update()).observe(box);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.update());
-    canvas.addEventListener("wheel", (event) => {
+    over.addEventListener("wheel", (event) => {
       if (!event.ctrlKey) return; // the page scrolls; two fingers on a touchpad come with ctrl
       event.preventDefault();
       this.zoom(Math.exp(Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY) / 100, 0.5)), this.timeAt(event.offsetX));
     }, { passive: false });
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
+    over.addEventListener("pointerdown", (event) => {
+      over.setPointerCapture(event.pointerId);
       this.fingers.set(event.pointerId, event.offsetX);
     });
-    canvas.addEventListener("pointermove", (event) => this.drag(event));
+    over.addEventListener("pointermove", (event) => this.drag(event));
     for (const name of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(name, (event) => this.fingers.delete(event.pointerId));
+      over.addEventListener(name, (event) => this.fingers.delete(event.pointerId));
     }
-    canvas.addEventListener("dblclick", () => this.goHome());
+    over.addEventListener("dblclick", () => this.goHome());
     box.addEventListener("keydown", (event) => {
       const [from, to] = this.range();
       const deeds = {
@@ -160,8 +144,8 @@ class Chart {
     });
   }
 
-  set(series) {
-    this.series = series;
+  set(tables) { // {time, low, high} of each series; high where it is a range
+    this.tables = tables;
     this.update();
   }
 
@@ -169,6 +153,14 @@ class Chart {
     if (this.waits) return;
     this.waits = true;
     requestAnimationFrame(() => this.draw());
+  }
+
+  draw() {
+    this.waits = false;
+    const { plot, box: { clientWidth: width, clientHeight: height } } = this;
+    if (!width || !height) return; // hidden; drawn when it is seen
+    if (width !== plot.width || height !== plot.height) plot.setSize({ width, height });
+    plot.setData(this.columns());
   }
 
   // --- which stretch is seen ---
@@ -219,14 +211,14 @@ class Chart {
     this.update();
   }
 
-  timeAt(px) {
+  timeAt(px) { // also where another stretch is not drawn yet
     const [from, to] = this.range();
-    return from + ((px - this.area.left) / this.area.width) * (to - from);
+    return from + (px / this.plot.over.clientWidth) * (to - from);
   }
 
   drag(event) {
     const before = this.fingers.get(event.pointerId);
-    if (before === undefined || !this.area) return;
+    if (before === undefined) return;
     const others = [...this.fingers].filter(([id]) => id !== event.pointerId).map(([, px]) => px);
     this.fingers.set(event.pointerId, event.offsetX);
     const moved = this.timeAt(before) - this.timeAt(event.offsetX);
@@ -236,168 +228,143 @@ class Chart {
     }
   }
 
-  // --- drawing ---
+  // --- what uPlot is told ---
 
-  draw() {
-    this.waits = false;
-    const { canvas, ctx, options } = this;
-    const { clientWidth: width, clientHeight: height } = canvas;
-    if (!width || !height) return; // hidden; drawn when it is seen
-    const ratio = devicePixelRatio || 1;
-    canvas.width = Math.round(width * ratio); // which also empties it
-    canvas.height = Math.round(height * ratio);
-    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    ctx.font = FONT;
+  columns() { // one time for all
+    return uPlot.join(this.tables.map(({ time, low, high }, i) => (this.series[i].isRange ? [time, low, high] : [time, low])));
+  }
+
+  layout() {
+    const { box, series, options: { values } } = this;
+    const told = series.filter(({ label }) => label).flatMap(({ first, last }) => [first, last]);
+    return {
+      width: box.clientWidth, height: box.clientHeight,
+      padding: [() => (this.options.unit ? READING_PX : 10), SIDE_PX, 0, 0],
+      legend: { show: false },
+      cursor: { y: false, drag: { x: false }, points: { size: (_, column) => (told.includes(column) ? 7 : 0) } },
+      select: { show: false },
+      scales: {
+        x: { time: false, range: () => this.range() },
+        y: { range: (_, low, high) => values(low ?? undefined, high ?? undefined) },
+      },
+      axes: [this.timeAxis(), this.valueAxis()],
+      series: [{}, ...series.flatMap((one) => (one.isRange ? [optionsOf(one), optionsOf(one)] : [optionsOf(one)]))],
+      bands: series.filter(({ fill }) => fill).map(
+        ({ first, last, colour: name, fill }) => ({ series: [last, first], fill: () => colour(name) + fill })),
+      hooks: {
+        drawClear: [() => this.inside(() => this.drawBands())],
+        draw: [() => this.inside(() => this.drawMarks()), () => this.drawUnit()],
+        setCursor: [() => this.read()],
+      },
+    };
+  }
+
+  timeAxis() {
+    const ticks = () => this.options.ticks;
+    return {
+      ...AXIS, size: BOTTOM_PX, gap: 3, space: TICK_PX.time,
+      incrs: () => ticks().steps,
+      splits: (_, axis, from, to, step) => ticksFrom(ticks().origin(), step, from, to),
+      values: (_, times, axis, space, step) => times.map((time) => ticks().text(time, step)),
+    };
+  }
+
+  valueAxis() {
+    return {
+      ...AXIS, gap: 3, space: TICK_PX.value, incrs: STEPS,
+      values: (_, values, axis, space, step) => values.map((value) => number(value, digitsOf(step))),
+      size: ({ ctx, axes }, texts) => {
+        [ctx.font] = axes[1].font;
+        const widest = Math.max(0, ...(texts || []).map((text) => ctx.measureText(text).width));
+        return Math.max(SIDE_PX, 14 + widest / uPlot.pxRatio);
+      },
+    };
+  }
+
+  read() { // the values at the pointer
+    const { data, cursor: { idx, idxs }, scales: { y } } = this.plot;
+    if (idx === null) {
+      this.reading.replaceChildren();
+      return;
+    }
     const [from, to] = this.range();
-    const parts = this.series.map((one) => part(one, from, to));
-    const [low, high] = options.values(...this.extent(parts));
-    const top = options.unit ? 28 : 10;
-    const values = numberTicks(low, high, (height - top - BOTTOM_PX) / TICK_PX.value);
-    const left = Math.max(SIDE_PX, 14 + Math.max(0, ...values.map(({ text }) => ctx.measureText(text).width)));
-    this.area = { left, top, width: width - left - SIDE_PX, height: height - top - BOTTOM_PX };
-    const x = (time) => left + ((time - from) / (to - from)) * this.area.width;
-    const y = (value) => top + ((high - value) / (high - low)) * this.area.height;
-    this.clipped(() => this.drawBands(from, to, x));
-    this.drawTicks(values, options.ticks()(from, to, this.area.width / TICK_PX.time), x, y);
-    this.clipped(() => {
-      this.series.forEach((one, i) => this.drawSeries(one, decimate(one, parts[i], x, 1 / ratio), y));
-      this.drawMarks(x);
+    const digits = digitsOf((y.max - y.min) / 100);
+    const told = this.series.filter(({ label, first }) => label && idxs[first] !== null)
+      .sort((one, other) => (one.order ?? 0) - (other.order ?? 0));
+    const values = told.map(({ label, colour: name, dots, first, last }) => {
+      const texts = [first, last].map((column) => number(data[column][idxs[column]] ?? null, digits));
+      const value = element("b", {}, [...new Set(texts)].join("–"));
+      if (!dots) value.style.color = `var(${name})`;
+      return element("span", {}, `${label} `, value);
     });
+    const time = element("span", {}, this.options.ticks.exactly(data[0][idx], to - from));
+    this.reading.replaceChildren(element("span", {}, time), element("span", {}, ...values));
   }
 
-  extent(parts) { // of the values that are seen
-    let [least, most] = [Infinity, -Infinity];
-    this.series.forEach(({ low, high = low }, n) => {
-      for (let i = parts[n][0]; i < parts[n][1]; i += 1) {
-        if (low[i] !== null && low[i] < least) least = low[i];
-        if (high[i] !== null && high[i] > most) most = high[i];
-      }
-    });
-    return least <= most ? [least, most] : [undefined, undefined];
-  }
+  // --- drawing beside uPlot, in pixels of the page ---
 
-  clipped(drawing) {
-    const { ctx, area } = this;
+  inside(drawing) { // from the corner of where the curves are, and not beyond
+    const { ctx, bbox: { left, top, width, height } } = this.plot;
     ctx.save();
     ctx.beginPath();
-    ctx.rect(area.left, area.top, area.width, area.height);
+    ctx.rect(left, top, width, height);
     ctx.clip();
+    ctx.setTransform(uPlot.pxRatio, 0, 0, uPlot.pxRatio, left, top);
+    ctx.font = FONT;
+    ctx.textAlign = "left";
     drawing();
     ctx.restore();
   }
 
-  drawBands(from, to, x) {
-    for (const band of this.options.bands(from, to)) {
-      this.ctx.fillStyle = colour(band.colour);
-      const left = Math.round(x(band.from));
-      const right = Math.round(x(band.to));
-      this.ctx.fillRect(left, this.area.top, right - left, this.area.height);
-      if (band.text) this.nameBand(band.text, left, right);
-    }
-  }
+  get area() { return { width: this.plot.over.clientWidth, height: this.plot.over.clientHeight }; }
 
-  nameBand(text, left, right) { // where there is room for it
-    const { ctx, area } = this;
-    const [from, to] = [Math.max(left, area.left), Math.min(right, area.left + area.width)];
-    if (ctx.measureText(text).width + 8 > to - from) return;
-    ctx.fillStyle = colour("--ink");
-    ctx.textAlign = "left";
-    ctx.textBaseline = "bottom";
-    ctx.fillText(text, from + 4, area.top + area.height - 3);
-  }
+  x(time) { return this.plot.valToPos(time, "x"); }
 
-  drawTicks(values, times, x, y) {
-    const { ctx, area } = this;
-    ctx.strokeStyle = colour("--line");
-    ctx.fillStyle = colour("--ink");
-    ctx.lineWidth = 1;
-    ctx.beginPath();
-    for (const { at } of values) this.line(area.left - 5, Math.round(y(at)) + 0.5, area.left + area.width);
-    for (const { at } of times) this.line(Math.round(x(at)) + 0.5, area.top, null, area.top + area.height + 5);
-    ctx.stroke();
-    ctx.textAlign = "right";
-    ctx.textBaseline = "middle";
-    for (const { at, text } of values) ctx.fillText(text, area.left - 8, y(at));
-    ctx.textAlign = "center";
-    ctx.textBaseline = "top";
-    for (const { at, text } of times) { // whole, also at the edge
-      const half = ctx.measureText(text).width / 2;
-      const middle = Math.max(half, Math.min(x(at), area.left + area.width + SIDE_PX - half));
-      ctx.fillText(text, middle, area.top + area.height + 8);
-    }
-    ctx.textAlign = "left";
+  drawUnit() {
+    const { ctx } = this.plot;
+    ctx.save();
+    ctx.setTransform(uPlot.pxRatio, 0, 0, uPlot.pxRatio, 0, 0);
+    Object.assign(ctx, { font: FONT, textAlign: "left", textBaseline: "top", fillStyle: colour("--ink") });
     ctx.fillText(this.options.unit, 4, 4);
+    ctx.restore();
   }
 
-  line(x, y, toX, toY) {
-    this.ctx.moveTo(x, y);
-    this.ctx.lineTo(toX ?? x, toY ?? y);
-  }
-
-  drawSeries(one, points, y) {
-    const { ctx } = this;
-    ctx.strokeStyle = ctx.fillStyle = colour(one.colour);
-    ctx.lineWidth = one.width || 0;
-    ctx.lineJoin = "round";
-    ctx.setLineDash(one.dash || []);
-    for (const run of runs(points)) {
-      if (one.dots) this.drawDots(run, y);
-      if (one.fill) this.fillBetween(run, y, one.fill);
-      if (one.width && one.high) for (const side of ["low", "high"]) this.trace(run, (p) => [y(p[side])]);
-      else if (one.width) this.trace(run, (p) => (p.low === p.high ? [y(p.low)] : [y(p.low), y(p.high)]));
-    }
-    ctx.setLineDash([]);
-  }
-
-  drawDots(run, y) {
-    for (const { x, low, high } of run) {
-      for (const value of new Set([low, high])) {
-        this.ctx.beginPath();
-        this.ctx.arc(x, y(value), 2.5, 0, 2 * Math.PI);
-        this.ctx.fill();
-      }
+  drawBands() {
+    const { plot: { ctx }, area } = this;
+    ctx.textBaseline = "bottom";
+    for (const band of this.options.bands(...this.range())) {
+      const [left, right] = [band.from, band.to].map((time) => Math.round(this.x(time)));
+      ctx.fillStyle = colour(band.colour);
+      ctx.fillRect(left, 0, right - left, area.height);
+      const [from, to] = [Math.max(left, 0), Math.min(right, area.width)];
+      if (!band.text || ctx.measureText(band.text).width + 8 > to - from) continue;
+      ctx.fillStyle = colour("--ink");
+      ctx.fillText(band.text, from + 4, area.height - 3);
     }
   }
 
-  fillBetween(run, y, opacity) {
-    const { ctx } = this;
-    ctx.globalAlpha = opacity;
-    ctx.beginPath();
-    for (const { x, high } of run) ctx.lineTo(x, y(high));
-    for (const { x, low } of [...run].reverse()) ctx.lineTo(x, y(low));
-    ctx.fill();
-    ctx.globalAlpha = 1;
-  }
-
-  trace(run, heights) {
-    this.ctx.beginPath();
-    for (const point of run) for (const height of heights(point)) this.ctx.lineTo(point.x, height);
-    this.ctx.stroke();
-  }
-
-  drawMarks(x) {
-    const { ctx, area } = this;
-    ctx.lineWidth = 2;
-    ctx.textAlign = "left";
+  drawMarks() {
+    const { plot: { ctx }, area } = this;
     ctx.textBaseline = "top";
     const inTime = this.options.marks().sort((one, other) => one.at - other.at);
     inTime.forEach(({ at, text, colour: name, dash = [], from, to }, i) => {
       ctx.strokeStyle = ctx.fillStyle = colour(name);
-      if (from !== undefined) this.shade(x(from), x(to));
+      if (from !== undefined) this.shade(this.x(from), this.x(to));
+      const x = this.x(at);
+      ctx.lineWidth = 2;
       ctx.setLineDash(dash);
       ctx.beginPath();
-      this.line(x(at), area.top, null, area.top + area.height);
+      ctx.moveTo(x, 0);
+      ctx.lineTo(x, area.height);
       ctx.stroke();
-      ctx.setLineDash([]);
-      if (x(at) < area.left || x(at) > area.left + area.width) return;
+      if (x < 0 || x > area.width) return;
       const { width } = ctx.measureText(text);
-      const begin = x(at) + 6 + width > area.left + area.width ? x(at) - 6 - width : x(at) + 6;
-      this.label(text, begin, area.top + 4 + 18 * (i % 3), width); // beside those of the same moment
+      this.label(text, x + 6 + width > area.width ? x - 6 - width : x + 6, 4 + 18 * (i % 3), width); // beside those of the same moment
     });
   }
 
   label(text, left, top, width) { // to be read over whatever is there
-    const { ctx } = this;
+    const { ctx } = this.plot;
     const ink = ctx.fillStyle;
     ctx.globalAlpha = 0.8;
     ctx.fillStyle = colour("--card");
@@ -408,9 +375,9 @@ class Chart {
   }
 
   shade(left, right) {
-    const { ctx, area } = this;
+    const { ctx } = this.plot;
     ctx.globalAlpha = 0.2;
-    ctx.fillRect(left, area.top, Math.max(right - left, 2), area.height);
+    ctx.fillRect(left, 0, Math.max(right - left, 2), this.area.height);
     ctx.globalAlpha = 1;
   }
 }

@@ -443,12 +443,23 @@ const VACUUM = { // what charts of it have in common
   values: (low = 0, high = 0) => [Math.min(low, -20), Math.max(high * 1.05, 100)],
 };
 
+const VACUUM_SERIES = [
+  { colour: "--orange", width: 3, dash: [8, 5], label: t("expected"), isRange: true },
+  { colour: "--blue", width: 2, fill: "54", label: t("measured"), isRange: true, order: -1 },
+];
+
 function drawVacuum(rows) {
   const side = (name) => ({ time: rows.time, low: rows[`${name}_low`], high: rows[`${name}_high`] });
-  live.chart.set([
-    { ...side("expected"), colour: "--orange", width: 3, dash: [8, 5] },
-    { ...side("measured"), colour: "--blue", width: 2, fill: 0.33 },
-  ]);
+  live.chart.set([side("expected"), side("measured")]);
+}
+
+function firstAfter(times, wanted) { // index of the first one that is later; times ascend
+  let [low, high] = [0, times.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] > wanted) high = middle; else low = middle + 1;
+  }
+  return low;
 }
 
 function headPlot(said) {
@@ -513,7 +524,7 @@ const live = {
   },
 
   show() {
-    if (!this.chart) this.chart = new Chart($("plot"), this.options());
+    if (!this.chart) this.chart = new Chart($("plot"), VACUUM_SERIES, this.options());
     if (past.on) return;
     drawVacuum(this.rows);
     this.head();
@@ -527,7 +538,7 @@ const live = {
     return {
       ...VACUUM, home, least: 0.5, tools: $("plot-tools"), back: t("Back to live"),
       all: () => [Math.min(home()[0], this.rows.time[0] ?? 0), home()[1]],
-      ticks: () => secondTicks(home()[1]),
+      ticks: secondsBefore(() => home()[1]),
       bands: (from, to) => this.phases(from, to),
       marks: () => this.alarms(),
       moved: () => this.head(),
@@ -546,9 +557,8 @@ const live = {
 
   phases(from, to) {
     const { time, phase } = this.rows;
-    const [first, end] = part(this.rows, from, to);
     const bands = [];
-    for (let i = first; i < end; i += 1) {
+    for (let i = Math.max(0, firstAfter(time, from) - 1); i <= Math.min(firstAfter(time, to), time.length - 1); i += 1) {
       const last = bands[bands.length - 1];
       if (last) last.to = time[i];
       if (!last || last.phase !== phase[i]) {
@@ -591,7 +601,7 @@ const past = { // takes the place of the live curve, by the clock of the run
       ...VACUUM, least: 0.5, most: LONGEST_S, leave: () => this.leave(),
       home: () => [now() - AROUND_S, now()],
       all: () => [now() - BACK_S, now()],
-      ticks: () => dateTicks,
+      ticks: dates,
       bands: () => this.bands(),
       marks: () => this.curve.alarms.flatMap(alarmMarks),
       moved: () => this.moved(),
@@ -785,28 +795,35 @@ function secondsOf(field) {
   return then.getTime() / 1000 - (zone === null ? 0 : zone + then.getTimezoneOffset() * 60);
 }
 
+const TREND_SERIES = [
+  { colour: "--blue", fill: "40", isRange: true },
+  { colour: "--grey", dots: true, label: t("measured") },
+  { colour: "--orange", width: 2, dash: [8, 5], spanGaps: true, label: t("expected") },
+  { colour: "--blue", width: 3, label: t("line") },
+  { colour: "--red", width: 3, dash: [2, 5] },
+];
+
 function drawTrend(trend) {
   const { time } = trend;
   const line = trend.line || { time: [], middle: [], low: [], high: [] };
   const span = [...time, ...line.time];
   trendSpan = [Math.min(...span), Math.max(...span)];
   if (trendSpan[0] === trendSpan[1]) trendSpan = [trendSpan[0] - 30, trendSpan[1] + 30];
-  const known = trend.expected.map((_, i) => i).filter((i) => trend.expected[i] !== null);
   const limit = trend.limit ?? null;
   if (!trendChart) {
-    trendChart = new Chart($("trend-plot"), {
+    trendChart = new Chart($("trend-plot"), TREND_SERIES, {
       home: () => trendSpan, all: () => trendSpan, least: 10, tools: $("trend-tools"),
-      values: (low = 0, high = 1) => roomy(low, high), ticks: () => dateTicks,
+      values: (low = 0, high = 1) => roomy(low, high), ticks: dates,
       marks: () => trendMarks, moved: () => trendChart && fillRange("trend", trendChart.range()),
     });
   }
   trendChart.options.unit = trend.unit;
   trendChart.set([
-    { time: line.time, low: line.low, high: line.high, colour: "--blue", fill: 0.25 },
-    { time, low: trend.measured, colour: "--grey", dots: true },
-    { time: known.map((i) => time[i]), low: known.map((i) => trend.expected[i]), colour: "--orange", width: 2, dash: [8, 5] },
-    { time: line.time, low: line.middle, colour: "--blue", width: 3 },
-    { time: limit === null ? [] : trendSpan, low: [limit, limit], colour: "--red", width: 3, dash: [2, 5] },
+    { time: line.time, low: line.low, high: line.high },
+    { time, low: trend.measured },
+    { time, low: trend.expected },
+    { time: line.time, low: line.middle },
+    limit === null ? { time: [], low: [] } : { time: trendSpan, low: [limit, limit] },
   ]);
   trendChart.goHome();
 }
