@@ -100,6 +100,14 @@ def test_an_export_of_advisories_is_read_and_told(tmp_path: Path) -> None:
     assert "None." in audit.report([], "PyPI, by pip-audit", document)
 
 
+def test_what_comes_of_npm_is_listed_with_its_licence_and_as_not_asked_about() -> None:
+    document = {"components": audit.npm_components()}
+    assert [entry["name"] for entry in document["components"]] == ["uplot"]
+    optional = audit.licences(document).partition("## Optional")[2]
+    assert "| uplot | 1.6.32 | MIT |" in optional
+    assert "Not asked: npm, about uplot" in audit.report([], "PyPI, by pip-audit", document)
+
+
 def test_no_answer_is_not_taken_for_a_good_one() -> None:
     vulnerable = {"id": "PYSEC-1", "fix_versions": ["2.0"], "description": "\n### Summary\nmore"}
     mid = {"name": "mid", "version": "1.0", "vulns": [vulnerable]}

@@ -205,6 +205,8 @@ def test_the_container_runs_as_nobody_and_on_a_root_that_cannot_be_written_to() 
     lines = (DEPLOY / "Containerfile").read_text().splitlines()
     (user,) = (line.split()[1] for line in lines if line.startswith("USER "))
     assert int(user.split(":")[0]) >= 1000
+    copied = {name for line in lines if line.startswith("COPY ") for name in line.split()}
+    assert {"pyproject.toml", "hatch_build.py", "twin", "drivers"} <= copied  # what a build reads
     compose = (DEPLOY / "compose.yaml").read_text()
     for wanted in ("read_only: true", "restart: always", "- ALL", "no-new-privileges:true"):
         assert wanted in compose

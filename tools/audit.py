@@ -26,6 +26,8 @@ from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
 ROOT = Path(__file__).resolve().parents[1]
+NPM_LOCK = ROOT / "twin" / "page" / "package-lock.json"
+NPM = "pkg:npm/"
 TOOLS = Path(sys.prefix) / "audit" / "bin"
 SCOPES = {
     "required": "the base needs it",
@@ -66,7 +68,26 @@ def bill_of_materials() -> dict[str, Any]:
         requirement for group in tables["optional-dependencies"].values() for requirement in group
     ]
     scoped(document, tables["dependencies"], extras, needs_of)
+    document["components"] += npm_components()
     return document
+
+
+def npm_components() -> list[dict[str, Any]]:
+    """What a wheel has of npm's packages, by the lock file: the page's, of the extra ``serve``."""
+    packages = json.loads(NPM_LOCK.read_text(encoding="utf-8"))["packages"]
+    return [
+        {
+            "type": "library",
+            "bom-ref": f"{NPM}{name}@{package['version']}",
+            "name": name,
+            "version": package["version"],
+            "purl": f"{NPM}{name}@{package['version']}",
+            "licenses": [{"license": {"id": package["license"]}}],
+            "scope": "optional",
+        }
+        for path, package in packages.items()
+        if (name := path.removeprefix("node_modules/"))
+    ]
 
 
 def scoped(
@@ -239,12 +260,19 @@ def _version(text: str) -> Version:
         return Version("0.dev0")
 
 
+def is_npm(component: Mapping[str, Any]) -> bool:
+    """Whether a component is a package of npm."""
+    return str(component.get("purl", "")).startswith(NPM)
+
+
 def report(
     vulnerabilities: Iterable[Vulnerability], source: str, document: Mapping[str, Any]
 ) -> str:
     """The vulnerabilities as Markdown, with their source."""
     scopes = {canonicalize_name(entry["name"]): entry["scope"] for entry in document["components"]}
     lines = ["# Known vulnerabilities", "", f"Asked: {source}.", ""]
+    if unasked := sorted(entry["name"] for entry in document["components"] if is_npm(entry)):
+        lines += [f"Not asked: npm, about {', '.join(unasked)}; `npm audit` in twin/page does.", ""]
     rows = [
         f"| {entry.package} | {entry.version} | {scopes.get(canonicalize_name(entry.package), '')} "
         f"| {entry.name} | {entry.fixed or 'none'} | {entry.summary.replace('|', '/')} |"
@@ -267,6 +295,7 @@ def main() -> int:
     installed = {
         canonicalize_name(component["name"]): component["version"]
         for component in document["components"]
+        if not is_npm(component)
     }
     try:
         if arguments.advisories:
