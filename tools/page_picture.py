@@ -33,6 +33,8 @@ def main(url: str, picture: Path, name: str, password: str) -> None:
         page.click("button")
         comment(page)
         page.wait_for_function("document.getElementById('measured').textContent !== '–'")
+        page.locator("#plot .u-over").hover()  # the values there are told above the curves
+        page.wait_for_timeout(500)
         picture.write_bytes(shrink(page.screenshot()))
         chromium.close()
 

@@ -75,6 +75,7 @@ function withColumns(series) { // of uPlot's data, whose first one is the time
 
 function optionsOf({ colour: name, width = 0, dash = [], dots = false, spanGaps = false }) {
   return {
+    pxAlign: 0, // smooth, where a curve is neither level nor upright
     stroke: () => colour(name), width, dash: dash.map((px) => px * uPlot.pxRatio), spanGaps,
     points: { show: dots, size: 5, width: 0, fill: () => colour(name) },
   };
