@@ -1,6 +1,6 @@
 """uPlot, which draws the page's curves: a package of npm, which hatch_build.py brings.
 
-It stands beside this module in a checkout, in an editable installation, and in a wheel.
+It is beside this module in a checkout, in an editable installation, and in a wheel.
 """
 
 import shlex
