@@ -784,6 +784,19 @@ def test_a_cause_too_small_to_matter_is_none_though_it_predicts_unseen_cycles(
     assert _confirmed(evidence, fitted, worn) is not None
 
 
+@pytest.mark.slow
+def test_a_delay_that_grows_from_the_beginning_far_beyond_an_edge_is_found() -> None:
+    """A linear model of it chooses another course, another onset, and a tenth of the size."""
+    answer = of(record(40.0, "blow_off_delay=150/ramp:39", seed=26)).json
+    (cause,) = answer["causes"]
+    assert (answer["verdict"], cause["effect"], cause["course"]) == (
+        "explained",
+        "blow_off_delay",
+        "ramp",
+    )
+    assert cause["parameters"]["delay"]["at_end"] == pytest.approx(150.0, rel=0.1)
+
+
 @cache
 def with_leak_and_heat() -> tuple[Evidence, list[int]]:
     """A leak whose gas is warmed by the wall more than usual, and the fitted cycles."""

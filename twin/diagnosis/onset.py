@@ -1,5 +1,6 @@
-"""When causes act: onsets of steps with their intervals, and cycles of intermittent causes."""
+"""When causes act: onsets of steps and ramps, and cycles of intermittent causes."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -10,10 +11,11 @@ from twin.diagnosis.fit import Fitted, profiled, white
 from twin.diagnosis.residual_covariance import ResidualWhitener, covariance
 from twin.inference.levels import CHI2_95
 from twin.model.courses import Cause, Course
+from twin.model.effects import effect_of
 from twin.monitor.bins import Floats
 from twin.signals import MS
 
-TRIED_TIMES = 6  # hypotheses whose times are searched, the most promising ones
+TRIED_TIMES = 6  # hypotheses of a course whose times are searched, the most promising ones
 MOST_FLIPS = 3  # rounds of a search for the cycles of an intermittent cause
 WORTH_FLIPPING = 5.0  # chi-square that another set of cycles must gain
 ONSETS, MANY_ONSETS = 16, 64  # tried in a round of a search for an onset
@@ -24,13 +26,14 @@ FARTHEST_S = 4.0  # largest distance of an onset's interval from it
 def with_times(
     evidence: Evidence, judged: ResidualWhitener, hypotheses: Sequence[Hypothesis]
 ) -> list[Hypothesis]:
-    """Hypotheses; the first few have their onset within a cycle, or their cycles, fitted."""
-    result, timed = [], 0
+    """Hypotheses; the first few of each course have their onset or their cycles searched."""
+    result, timed = [], Counter[Course]()
     for hypothesis in hypotheses:
-        adjust = _PLACED.get(hypothesis[-1].course)
-        if adjust is not None and timed < TRIED_TIMES:
+        course = hypothesis[-1].course
+        adjust = _PLACED.get(course)
+        if adjust is not None and timed[course] < TRIED_TIMES:
             result.append(adjust(evidence, judged, hypothesis))
-            timed += 1
+            timed[course] += 1
         else:
             result.append(hypothesis)
     return result
@@ -88,7 +91,34 @@ def _union(cycles: Iterable[frozenset[int]]) -> frozenset[int]:
     return frozenset[int]().union(*cycles)
 
 
-_PLACED = {Course.STEP: _with_onset, Course.INTERMITTENT: _with_cycles}
+def _with_begin(evidence: Evidence, judged: ResidualWhitener, hypothesis: Hypothesis) -> Hypothesis:
+    """A hypothesis whose last cause, a ramp, grows from the best cycle to the size it reaches.
+
+    The linear model chose the cycle: of a delay that grows large, it chooses a wrong one.
+    """
+    *others, cause = hypothesis
+    starts = evidence.seconds[evidence.starts[np.array(judged.cycles)[1:]]]
+    tried = [cause, *(_grown_from(evidence, cause, float(onset)) for onset in (0.0, *starts))]
+    chi2 = np.sum(white(evidence, judged, [(*others, trial) for trial in tried]) ** 2, axis=0)
+    return (*others, tried[int(np.argmin(chi2))])
+
+
+def _grown_from(evidence: Evidence, ramp: Cause, onset: float) -> Cause:
+    """A ramp from another onset (s) that reaches the same size in the last row."""
+    last = float(evidence.seconds[-1])
+    faster = (last - ramp.onset_s) / (last - onset)
+    shaping = {p.name for p in effect_of(ramp.effect).parameters if p.shapes} | {*ramp.law()}
+    values = {
+        name: value if name in shaping else value * faster for name, value in ramp.values.items()
+    }
+    return replace(ramp, onset_s=onset, values=values)
+
+
+_PLACED = {
+    Course.STEP: _with_onset,
+    Course.RAMP: _with_begin,
+    Course.INTERMITTENT: _with_cycles,
+}
 
 
 def with_fine_onsets(

@@ -64,12 +64,15 @@ QUIET = 1.2  # leftover (sigmas) below which no comparison is needed
 HOPEFUL = 5.0  # least gain (chi-square) of one more cause in the linear model
 TRIED_PAIRS, TRIED_MORE = 12, 8
 # Leftover (sigmas) of the best single cause above which sizes are too large for a linear model to
-# tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4.
+# tell courses apart. Chosen: in pairs of the second world's batteries one leaves up to 4. A delay
+# is far from linear: its courses are told apart by fits wherever more than noise is left.
 GREAT = 10.0
 SECOND = 0.5  # of the best gain, above which an effect's second course is fitted as well
 NEARLY = 0.3  # of the best gain, above which an effect may turn out to be a rival
 START = np.array([0.4, 1.4, 4.0])  # typical sizes from which a fit starts
-START_OF_TIMES = np.array([0.4, 1.0, 1.7, 2.5, 3.5, 5.0])  # the same for delays, far from linear
+# The same for times, up to the 400 ms to which they are bounded: a step to the next one is less
+# than half of it, since an edge that moves by more than it lasts has no slope towards its place.
+START_OF_TIMES = np.geomspace(0.4, 40.0, 13)
 
 Progress = Callable[[str], None]
 _NO_SIZES = np.empty(0), np.empty(0)
@@ -375,16 +378,19 @@ def _fit_singles(
     progress("fitting single causes")
     started = _started(evidence, judged, hypotheses)
     tried = fit(evidence, weights, with_times(evidence, judged, started))
-    if min(candidate.leftover for candidate in tried) < GREAT:
+    least = min(candidate.leftover for candidate in tried)
+    if least < QUIET:
         return tried
-    progress("what acts is great: fitting each cause with every course")
-    more = [
+    progress("more than noise is left: fitting causes with other courses")
+    others = [
         candidate.hypothesis
         for candidate in linear_gains(evidence, judged, linear, each=len(Course))
+        if candidate.hypothesis not in hypotheses
+        and (least > GREAT or parameters(candidate.hypothesis)[0].is_time)
     ]
-    started = _started(
-        evidence, judged, [hypothesis for hypothesis in more if hypothesis not in hypotheses]
-    )
+    if not others:
+        return tried
+    started = _started(evidence, judged, others)
     return tried + fit(evidence, weights, with_times(evidence, judged, started))
 
 
