@@ -247,6 +247,43 @@ def test_a_system_that_still_settles_is_not_open(settles_s: float, opened: bool)
     assert not opened or read(rows).idle / MBAR == pytest.approx(960.0, abs=0.2)
 
 
+@pytest.mark.parametrize(("hold_s", "saves_air"), [(5.0, False), (20.0, False), (5.0, True)])
+def test_noise_in_a_long_hold_is_no_air_saving(hold_s: float, saves_air: bool) -> None:
+    """Rows 2 ms apart with noise of 1 mbar; an ejector that saves air lets 8 mbar in."""
+    fall = 300.0 + 660.0 * np.exp(-np.arange(250) / 30.0)
+    hold = np.linspace(300.0, 308.0 if saves_air else 300.0, round(hold_s / 2e-3))
+    cycle = np.concatenate([fall, hold, np.linspace(300.0, 990.0, 50), np.full(200, 960.0)])
+    commands = [Command.SUCTION, Command.BLOW_OFF, 0]
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 2_000_000
+    rows["sequence"] = np.arange(len(rows))
+    rows["commands"] = np.tile(np.repeat(commands, [250 + len(hold), 50, 200]), 6)
+    noise = np.random.default_rng(3).normal(0.0, 1.0, len(rows))
+    rows["pressure"] = (np.tile(cycle, 6) + noise) * MBAR
+    assert read(rows).saves_air == saves_air
+
+
+@pytest.mark.parametrize("each", [1, 3])
+def test_a_pause_after_suction_says_nothing_of_ambient_pressure(each: int) -> None:
+    """In every cycle, or in each third, a pause of 150 ms holds the vacuum before blow-off."""
+    cycle = np.concatenate([np.linspace(960.0, 300.0, 400), np.full(150, 300.0)])
+    cycle = np.concatenate([cycle, np.linspace(300.0, 990.0, 100), np.full(400, 960.0)])
+    rows = np.zeros(6 * len(cycle), SAMPLE)
+    rows["time_ns"] = np.arange(len(rows)) * 1_000_000
+    rows["sequence"] = np.arange(len(rows))
+    pauses = [0 if number % each == 0 else Command.SUCTION for number in range(6)]
+    rows["commands"] = np.concatenate(
+        [
+            np.repeat([Command.SUCTION, pause, Command.BLOW_OFF, 0], [400, 150, 100, 400])
+            for pause in pauses
+        ]
+    )
+    rows["pressure"] = np.tile(cycle, 6) * MBAR
+    found = read(rows)
+    assert found.opened
+    assert found.idle / MBAR == pytest.approx(960.0, abs=0.1)
+
+
 def test_the_record_shows_what_flows_back_once_suction_has_ended() -> None:
     """Pause of 50 ms in which the pressure rises by 2 mbar/ms, from the 20th one on."""
     pause = 300.0 + 2.0 * np.maximum(np.arange(50) - 20.0, 0.0)

@@ -28,8 +28,10 @@ Floats = npt.NDArray[np.float64]
 WINDOW_MS, FEWEST_ROWS = 40.0, 16
 QUIET = 0.3
 SMOOTH_MS = 20.0  # a period of the mains: width of the mean before turning points are searched
-CLEAR = 6.0  # sigmas of the smoothed pressure: the least height of a turn
-LEAST_TURN = 1.5 * MBAR  # Pa
+CLEAR = 6.0  # sigmas of a pressure that differs from another
+# Least height of a turn: sigmas of the smoothed pressure, and Pa. In a hold of 5 to 20 s noise alone
+# turns by 6 to 7 sigmas, and short windows show a sigma up to a sixth too small.
+TURN, LEAST_TURN = 9.0, 1.5 * MBAR
 EDGE_MS = 30.0  # after a command: turns in it are due to the valve's delay
 DEEP = 0.3  # share of the fall, above the lowest pressure, in which the nozzle may go off
 AGAIN = 0.5  # least fall after a rise, over the rise, if the nozzle went on again
@@ -133,7 +135,7 @@ def read(samples: Samples) -> Readings:
     command_stretches = list(stretches(rows["commands"]))
     width = max(round(SMOOTH_MS * MS / period), 3)
     edge = max(round(EDGE_MS * MS / period), 1)
-    turn = max(CLEAR * noise / np.sqrt(width), LEAST_TURN)
+    turn = max(TURN * noise / np.sqrt(width), LEAST_TURN)
     suctions = [stretch for stretch in command_stretches if stretch.command == Command.SUCTION]
     offs, ons, switches = [], [], 0
     reported = reports_nozzle(rows["reported"][rows["commands"] == Command.SUCTION])
@@ -271,13 +273,10 @@ def _idle(
 
     A closed system that settles slowly moves little in some milliseconds, like an open one, so
     longer parts are compared. The end of an idle does not count, as a cup may touch its part then.
+    If any idle follows blow-off, the others are pauses, which hold the vacuum of their suction.
     """
     half = max(rows // 2, 1)
-    idles = [
-        idle
-        for idle in command_stretches[1:]
-        if idle.command == 0 and idle.last - idle.first >= 2 * rows
-    ]
+    idles = _long_idles(command_stretches, 2 * rows)
     if not idles:
         return float("nan"), False
     moves, levels = [], np.empty(len(idles))
@@ -291,6 +290,17 @@ def _idle(
     most_move = STILL * noise * np.sqrt(2.0 / half) + 0.1 * MBAR
     opened = bool(np.median(moves) < most_move and np.ptp(levels) < 2.0 * MBAR + 4.0 * noise)
     return float(np.median(levels)), opened
+
+
+def _long_idles(command_stretches: list[Stretch], rows: int) -> list[Stretch]:
+    """Idles of at least so many rows after blow-off; if there are none, after anything else."""
+    long = [
+        (previous.command, idle)
+        for previous, idle in pairwise(command_stretches)
+        if idle.command == 0 and idle.last - idle.first >= rows
+    ]
+    released = [idle for command, idle in long if command == Command.BLOW_OFF]
+    return released or [idle for _, idle in long]
 
 
 def _rises(pressure: Floats, command_stretches: list[Stretch], command: int) -> bool:
