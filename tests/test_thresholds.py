@@ -4,11 +4,12 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import rigs
 from calibrations import quiet, typed
 
-from twin.calibration.commission import _shown, commission, guessed, switching_as
+from twin.calibration.commission import _shown, as_switched, commission, guessed, switching_as
 from twin.calibration.cycles import Cycles
 from twin.calibration.fit import Fitted
 from twin.calibration.parameters import Free
@@ -57,8 +58,23 @@ def slowly_closing(seed: int) -> DataSet:
 @cache
 def recorded(seed: int) -> tuple[DataSet, Samples, tuple[tuple[int, bool], ...]]:
     """The gripper, a record of it, and rows at which its nozzle acts, and whether it goes on."""
-    data, rng = slowly_closing(seed), np.random.default_rng([seed, 1])
+    data = slowly_closing(seed)
+    samples, phase = simulated(data, seed)
     theta = coefficients(data)
+    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
+    rows = np.flatnonzero((np.diff(phase) != 0) & inside[1:] & inside[:-1]) + 1
+    response = np.where(phase[rows] == Phase.SUCTION, theta[c.RESPONSE], theta[c.RESPONSE_OFF])
+    acts = rows + np.rint(response / MS).astype(int)
+    return (
+        data,
+        samples,
+        tuple(zip(acts.tolist(), (phase[rows] == Phase.SUCTION).tolist(), strict=True)),
+    )
+
+
+def simulated(data: DataSet, seed: int) -> tuple[Samples, npt.NDArray[np.uint8]]:
+    """A record of a unit with ``data``, and the phase of each row."""
+    theta, rng = coefficients(data), np.random.default_rng([seed, 1])
     cycle = [(0, 400), (Command.SUCTION, 2000), (Command.BLOW_OFF, 300), (0, 300)]
     pieces = [np.full(rows + int(rng.integers(200)), int(command)) for command, rows in 8 * cycle]
     samples = np.zeros(sum(map(len, pieces)), SAMPLE)
@@ -69,15 +85,7 @@ def recorded(seed: int) -> tuple[DataSet, Samples, tuple[tuple[int, bool], ...]]
         theta, np.full(len(samples), MS), np.ascontiguousarray(samples["commands"])
     )
     samples["pressure"] = expected + NOISE * rng.standard_normal(len(samples))
-    inside = np.isin(phase, (Phase.SUCTION, Phase.HOLD))
-    rows = np.flatnonzero((np.diff(phase) != 0) & inside[1:] & inside[:-1]) + 1
-    response = np.where(phase[rows] == Phase.SUCTION, theta[c.RESPONSE], theta[c.RESPONSE_OFF])
-    acts = rows + np.rint(response / MS).astype(int)
-    return (
-        data,
-        samples,
-        tuple(zip(acts.tolist(), (phase[rows] == Phase.SUCTION).tolist(), strict=True)),
-    )
+    return samples, phase
 
 
 def with_turns(data: DataSet, samples: Samples) -> DataSet:
@@ -116,6 +124,24 @@ def not_seen(data: DataSet, samples: Samples, acts: tuple[tuple[int, bool], ...]
         for row, goes_on in acts
         if suction[row]
     )
+
+
+def test_a_supply_that_sags_is_no_air_saving() -> None:
+    """It gives way by 0.7 bar within 0.3 s, so that the vacuum falls again from its highest."""
+    data = slowly_closing(0)
+    ejector = data.ejector.model_copy(update={"air_saving": "off"})
+    supply = data.supply.model_copy(update={"droop_bar": 0.7, "lag_ms": 300.0})
+    samples = simulated(data.model_copy(update={"ejector": ejector, "supply": supply}), 0)[0]
+    readings = read(samples)
+    assert readings.saves_air, "by the turns of the pressure alone"
+    guess = guessed(data, readings)[0]
+    readings = as_switched(readings, Cycles.found(samples, guess))
+    assert not readings.saves_air
+    without = switching_as(guessed(data, readings)[0], guess).ejector
+    assert (without.air_saving, without.h1_mbar) == ("off", data.ejector.h1_mbar)
+    _, saving, _ = recorded(0)
+    readings = read(saving)
+    assert as_switched(readings, Cycles.found(saving, guess)) == readings
 
 
 @pytest.mark.slow

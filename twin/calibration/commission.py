@@ -217,6 +217,7 @@ def commission(
         lambda starting: _fit(used, starting, free, progress),
         progress,
     )
+    readings = as_switched(readings, found_cycles)
     if fitted.data.ambient != guess.ambient:  # thresholds count from ambient pressure
         metered = within(metered, fitted.data.ambient)
     fitted, remarks, readings = _deciding(fitted, found_cycles, metered, readings)
@@ -402,6 +403,17 @@ def other_tubes(guesses: Sequence[DataSet], best: DataSet) -> list[DataSet]:
     return others
 
 
+def as_switched(readings: Readings, cycles: Cycles) -> Readings:
+    """``readings`` without air saving if no switching was found in ``cycles``.
+
+    Where the supply sags, the pressure turns as by air saving, but slowly. The fit, which had no
+    hold then, is of an ejector that never switches off.
+    """
+    if not readings.saves_air or len(cycles.switchings[0]):
+        return readings
+    return replace(readings, switches=0, off=np.nan, on=np.nan)
+
+
 def _deciding(
     fitted: Fitted, cycles: Cycles, configured: DataSet, readings: Readings
 ) -> tuple[Fitted, list[Remark], Readings]:
@@ -410,16 +422,15 @@ def _deciding(
     Until the fit they are where the pressure turns. The third value are the readings with these
     thresholds.
     """
-    if not readings.saves_air:
-        return fitted, guessed(configured, readings)[1], readings
-    decisions = decided(readings, cycles, coefficients(fitted.data))
-    guess, remarks = guessed(configured, decisions)
-    return replace(fitted, data=switching_as(guess, fitted.data)), remarks, decisions
+    if readings.saves_air:
+        readings = decided(readings, cycles, coefficients(fitted.data))
+    guess, remarks = guessed(configured, readings)
+    return replace(fitted, data=switching_as(guess, fitted.data)), remarks, readings
 
 
 def switching_as(guess: DataSet, data: DataSet) -> DataSet:
-    """``data`` with the thresholds of ``guess``."""
-    thresholds = {key: getattr(guess.ejector, key) for key in _THRESHOLDS}
+    """``data`` with the air saving of ``guess`` and its thresholds."""
+    thresholds = {key: getattr(guess.ejector, key) for key in ("air_saving", *_THRESHOLDS)}
     return data.model_copy(update={"ejector": data.ejector.model_copy(update=thresholds)})
 
 
