@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from twin.calibration.cycles import Cycles
+from twin.calibration.empty_picks import without_empty_picks
 from twin.calibration.fit import Fitted, fit
 from twin.calibration.parameters import FREE, Space
 from twin.calibration.readings import read
@@ -73,7 +74,8 @@ def calibrate(
     """
     progress("reading the log")
     samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    gauged, remarks = as_gauged(config.data, samples)
+    samples, by_picks = picked(config.data, samples)
+    gauged, by_gauge = as_gauged(config.data, samples)
     config = replace(config, data=taken_in(gauged, samples))
     before = complete(config.data, samples)
     refuse_insufficient(samples, before, "calibration")
@@ -91,7 +93,21 @@ def calibrate(
     healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
     times = samples["host_ns"]
     ends = int(times[0]), int(times[-1])
-    return Calibration(fitted, verdict, healthy, len(cycles), *ends, tuple(remarks))
+    return Calibration(fitted, verdict, healthy, len(cycles), *ends, (*by_picks, *by_gauge))
+
+
+def picked(data: DataSet, samples: Samples) -> tuple[Samples, list[Remark]]:
+    """``samples`` without suctions that met no part, and a remark if there are any."""
+    with_part, empty = without_empty_picks(data, samples)
+    if not empty:
+        return samples, []
+    left_out = (
+        "1 suction met no part and was left out"
+        if empty == 1
+        else f"{empty} suctions met no part and were left out"
+    )
+    line = '[[data.system.parts]] kind = "vessel", if no part is picked up'
+    return with_part, [Remark(left_out, line)]
 
 
 def as_gauged(data: DataSet, samples: Samples) -> tuple[DataSet, list[Remark]]:

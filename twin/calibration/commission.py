@@ -21,6 +21,7 @@ from twin.calibration.calibrate import (
     complete,
     contradictions,
     like_these,
+    picked,
     refuse_insufficient,
     scatter,
 )
@@ -168,8 +169,7 @@ def commission(
     well the twin follows the record; a caller must check it before storing the result.
     """
     progress("reading the record")
-    samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    refuse_empty(samples)
+    samples, by_picks = _with_parts(config.data, blocks)
     readings = read(samples)
     refuse_unreadable(readings)
     optimum_is_told = "optimum_bar" in config.data.supply.model_fields_set
@@ -230,7 +230,7 @@ def commission(
             samples, readings.noise, _fit(used, [start], known, progress), progress
         )[-1],
     )
-    remarks = [*by_gauge, *by_flow, *remarks, *of_fit]
+    remarks = [*by_picks, *by_gauge, *by_flow, *remarks, *of_fit]
     cycles = complete(fitted.data, samples)
     sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     unseen_level = _unseen_level(readings, is_told=hysteresis_is_told)
@@ -312,6 +312,13 @@ def unreported(samples: Samples) -> Samples:
     samples = samples.copy()
     samples["reported"] &= ~np.uint8(Reported.NOZZLE_KNOWN | Reported.NOZZLE)
     return samples
+
+
+def _with_parts(data: DataSet, blocks: Iterable[Samples]) -> tuple[Samples, list[Remark]]:
+    """The record without suctions that met no part, and a remark if there are any."""
+    samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
+    refuse_empty(samples)
+    return picked(data, samples)
 
 
 def refuse_empty(samples: Samples) -> None:

@@ -29,8 +29,8 @@ WINDOW_MS, FEWEST_ROWS = 40.0, 16
 QUIET = 0.3
 SMOOTH_MS = 20.0  # a period of the mains: width of the mean before turning points are searched
 CLEAR = 6.0  # sigmas of a pressure that differs from another
-# Least height of a turn: sigmas of the smoothed pressure, and Pa. In a hold of 5 to 20 s noise alone
-# turns by 6 to 7 sigmas, and short windows show a sigma up to a sixth too small.
+# Least height of a turn: sigmas of the smoothed pressure, and Pa. In holds of 5 to 20 s noise alone
+# turns by 6 to 7 sigmas, and the quiet windows show a sigma that is a sixth too small.
 TURN, LEAST_TURN = 9.0, 1.5 * MBAR
 EDGE_MS = 30.0  # after a command: turns in it are due to the valve's delay
 DEEP = 0.3  # share of the fall, above the lowest pressure, in which the nozzle may go off

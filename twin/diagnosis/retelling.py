@@ -98,6 +98,9 @@ _COMMISSIONING = (  # what a record corrects in the configuration, and the lines
     "the opened system stands at {measured} mbar; the configuration says {configured}",
     "the closed system follows an ambient pressure of {fitted} mbar; the configuration says"
     " {configured}",
+    "1 suction met no part and was left out",
+    "{empty} suctions met no part and were left out",
+    '[[data.system.parts]] kind = "vessel", if no part is picked up',
     "in no suction the nozzle goes off by itself; the configuration has air saving on",
     "no row of the record has blow-off; where the unit has one, its command is missing",
     "the vacuum is {highest} mbar at most, where ejectors make 300 and more",

@@ -1,0 +1,74 @@
+"""Suctions that met no part, in a record that a unit is commissioned on."""
+
+import numpy as np
+import pytest
+from calibrations import log_of, typed
+
+from twin.calibration.calibrate import picked
+from twin.calibration.empty_picks import without_empty_picks
+from twin.calibration.readings import Stretch, stretches
+from twin.signals import Command, Samples
+
+NAME = "gripper"
+
+
+def suctions_of(samples: Samples) -> list[Stretch]:
+    return [
+        stretch for stretch in stretches(samples["commands"]) if stretch.command == Command.SUCTION
+    ]
+
+
+def with_empty_picks(name: str, numbers: tuple[int, ...]) -> Samples:
+    """A record in some of whose suctions the vacuum is a tenth of what it was."""
+    samples = log_of(name).copy()
+    suctions = suctions_of(samples)
+    ends = [*(suction.first for suction in suctions[1:]), len(samples)]
+    for number in numbers:
+        part = slice(suctions[number].first, ends[number])
+        pressure = samples["pressure"][part]
+        samples["pressure"][part] = pressure[0] + 0.1 * (pressure - pressure[0])
+    return samples
+
+
+@pytest.mark.parametrize("numbers", [(2,), (0, 3), (1, 2)])
+def test_cycles_without_a_part_are_left_out_and_time_runs_on(numbers: tuple[int, ...]) -> None:
+    samples = with_empty_picks(NAME, numbers)
+    suctions = suctions_of(samples)
+    with_part, empty = without_empty_picks(typed(NAME).data, samples)
+    assert empty == len(numbers)
+    rows = sum(suctions[number + 1].first - suctions[number].first for number in numbers)
+    assert len(with_part) == len(samples) - rows
+    assert np.ptp(np.diff(with_part["time_ns"])) == np.ptp(np.diff(samples["time_ns"]))
+    assert (np.diff(with_part["sequence"]) == 1).all()
+    assert len(suctions_of(with_part)) == len(suctions) - len(numbers)
+    assert without_empty_picks(typed(NAME).data, with_part)[1] == 0
+
+
+def test_the_last_cycle_may_be_one() -> None:
+    samples = with_empty_picks(NAME, (len(suctions_of(log_of(NAME))) - 1,))
+    with_part, empty = without_empty_picks(typed(NAME).data, samples)
+    assert empty == 1
+    assert (with_part == samples[: len(with_part)]).all()
+
+
+def test_a_short_suction_with_a_part_is_none() -> None:
+    """Its command ends at a tenth of the time, while the pressure still falls."""
+    samples = log_of(NAME).copy()
+    third = suctions_of(samples)[2]
+    short = third.first + (third.last - third.first) // 10
+    samples["commands"][short : third.last] = 0
+    samples["pressure"][short : third.last] = samples["pressure"][third.first]
+    assert without_empty_picks(typed(NAME).data, samples)[1] == 0
+
+
+def test_a_healthy_record_and_a_vessel_stay_as_they_are() -> None:
+    samples = log_of(NAME)
+    assert without_empty_picks(typed(NAME).data, samples)[0] is samples
+    vessel = with_empty_picks("test_rig", (2,))
+    assert without_empty_picks(typed("test_rig").data, vessel)[0] is vessel
+
+
+@pytest.mark.parametrize(("numbers", "said"), [((2,), "1 suction met"), ((1, 3), "2 suctions met")])
+def test_it_is_said_how_many_were_left_out(numbers: tuple[int, ...], said: str) -> None:
+    _, (remark,) = picked(typed(NAME).data, with_empty_picks(NAME, numbers))
+    assert remark.text.startswith(said)
