@@ -7,6 +7,7 @@ from calibrations import log_of, typed
 from twin.calibration.calibrate import picked
 from twin.calibration.empty_picks import without_empty_picks
 from twin.calibration.readings import Stretch, stretches
+from twin.diagnosis.evidence import read_cycles
 from twin.signals import Command, Samples
 
 NAME = "gripper"
@@ -72,3 +73,28 @@ def test_a_healthy_record_and_a_vessel_stay_as_they_are() -> None:
 def test_it_is_said_how_many_were_left_out(numbers: tuple[int, ...], said: str) -> None:
     _, (remark,) = picked(typed(NAME).data, with_empty_picks(NAME, numbers))
     assert remark.text.startswith(said)
+
+
+# In a log that is diagnosed.
+
+
+@pytest.mark.parametrize("numbers", [(4,), (3, 5, 6)])
+def test_cycles_without_a_part_are_not_judged(numbers: tuple[int, ...]) -> None:
+    usual = read_cycles(typed(NAME), [log_of(NAME)])
+    assert usual.without_part == []
+    log = read_cycles(typed(NAME), [with_empty_picks(NAME, numbers)])
+    begins = [suction.first for suction in suctions_of(log_of(NAME))]
+    first = begins.index(int(usual.rows(0)[0]["sequence"][0] - log_of(NAME)["sequence"][0]))
+    assert log.without_part == [number - first for number in numbers]
+    assert log.judged == [cycle for cycle in usual.judged if cycle not in log.without_part]
+
+
+def test_little_vacuum_in_most_cycles_is_a_fault() -> None:
+    log = read_cycles(typed(NAME), [with_empty_picks(NAME, tuple(range(2, 10)))])
+    assert log.without_part == []
+    assert log.judged == read_cycles(typed(NAME), [log_of(NAME)]).judged
+
+
+def test_a_vessel_meets_no_part_in_any_cycle() -> None:
+    log = read_cycles(typed("test_rig"), [with_empty_picks("test_rig", (3,))])
+    assert log.without_part == []

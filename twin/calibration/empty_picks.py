@@ -10,10 +10,10 @@ import numpy.typing as npt
 from twin.calibration.readings import Stretch, stretches
 from twin.model.dataset import DataSet
 from twin.model.parts import Cups
+from twin.monitor.cycles import OPEN_CUPS
 from twin.quality import UNUSABLE
 from twin.signals import Command, Samples
 
-OPEN = 0.5  # of the usual vacuum after as long a suction, which open cups do not reach
 FEWEST = 3  # suctions, to know what is usual
 
 
@@ -54,6 +54,6 @@ def _are_empty(samples: Samples, suctions: list[Stretch]) -> npt.NDArray[np.bool
     def is_empty(number: int) -> bool:
         last = min(int(rows[number]), usual_rows) - 1
         others = [curve[last] for curve in lowest if len(curve) > last]
-        return bool(ambient - lowest[number][-1] < OPEN * (ambient - np.median(others)))
+        return bool(ambient - lowest[number][-1] < OPEN_CUPS * (ambient - np.median(others)))
 
     return np.array([is_empty(number) for number in range(len(suctions))], np.bool_)

@@ -117,6 +117,8 @@ def diagnose(
     if config.weak:
         head["twin"] = {"verdict": "usable", "weak": dict(config.weak)}
     part = _part(blocks, before_s)
+    if whole_log.without_part:
+        part["without_part"] = whole_log.without_part
     unrecorded = f"{derived}: record the commands as well" if derived else None
     evidence = thinned(whole_log, whole_log.judged, MOST_JUDGED)
     if reason := unrecorded or _not_commissioned(config) or insufficient(whole_log, evidence):

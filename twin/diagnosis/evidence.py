@@ -32,7 +32,7 @@ from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.cycles import cut, figures
+from twin.monitor.cycles import cut, figures, met_no_part
 from twin.monitor.detector_window import detector_of, select_window
 from twin.monitor.healthy import Healthy
 from twin.monitor.measured_supply import is_gauge, lower_by
@@ -63,6 +63,8 @@ OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # number of cores for a diagnosis
 NEARBY = 0.1  # sigmas of a data set's uncertainty within which the response is linear
 FASTEST, PIECE = 1, 100_000  # zlib's level, at which a row takes 4 bytes; rows of a piece
+# Share of the cycles that may have met no part; if more have so little vacuum, it is a fault.
+MOST_WITHOUT_PART = 0.5
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles; largest, in rows
 
 Phases = npt.NDArray[np.uint8]
@@ -568,6 +570,7 @@ class LogCycles:
     figures: list[dict[str, float]]
     saturated: float  # share of saturated rows
     packed: list[list[bytes]]  # compressed pieces of each cycle
+    without_part: list[int]  # cycles in which cups met no part; they are not judged
 
     @property
     def cycles(self) -> int:
@@ -661,6 +664,7 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         _detected_switchings={},  # depends on the settings of the detector
     )
     begins, judged, packed = list[int](), list[int](), list[list[bytes]]()
+    without_part = list[int]()
     figures_of_cycles, rows, saturated = list[dict[str, float]](), 0, 0
     told_detector, nozzle = smoothed(theta, detector, _Bridged(blocks))
     twin = Twin(base.theta, told_detector, base.terms, nozzle)
@@ -669,6 +673,8 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
             continue
         if cycle.settled:
             judged.append(len(packed))
+        if met_no_part(cycle, theta):
+            without_part.append(len(packed))
         begins.append(int(cycle.samples["time_ns"][0]))
         figures_of_cycles.append(figures(cycle, theta))
         packed.append(_packed(cycle.samples, cycle.ticks))
@@ -676,7 +682,10 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         saturated += int(np.count_nonzero(cycle.samples["quality"] & OVERFLOW))
     seconds = (np.array(begins, np.int64) - base.begin_ns).astype(np.float64) * NS
     share = saturated / max(rows, 1)
-    return LogCycles(base, seconds, judged, figures_of_cycles, share, packed)
+    if len(without_part) > MOST_WITHOUT_PART * len(packed):
+        without_part = []
+    judged = [cycle for cycle in judged if cycle not in without_part]
+    return LogCycles(base, seconds, judged, figures_of_cycles, share, packed, without_part)
 
 
 def _packed(samples: Samples, ticks: Ticks) -> list[bytes]:

@@ -462,6 +462,8 @@ def _cycles(answer: Answer) -> list[tuple[str, str]]:
     if cycles["fitted"]:
         rows.append((tr("fitted on"), some(cycles["fitted"])))
         rows.append((tr("held out, to judge by"), held_out_cycles(answer)))
+    if "without_part" in cycles:
+        rows.append((tr("not judged, as they met no part"), some(cycles["without_part"])))
     return rows
 
 

@@ -172,6 +172,8 @@ def _facts(answer: Answer, now_ns: int) -> Iterator[tuple[str, str]]:
     yield from to_do(answer)
     if weakness := weakness_of(answer):
         yield "the twin", weakness
+    if "without_part" in answer["cycles"]:
+        yield "not judged", f"cycles that met no part: {some(answer['cycles']['without_part'])}"
     if answer["verdict"] == "insufficient":
         return
     yield (
