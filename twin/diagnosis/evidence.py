@@ -63,8 +63,9 @@ OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # number of cores for a diagnosis
 NEARBY = 0.1  # sigmas of a data set's uncertainty within which the response is linear
 FASTEST, PIECE = 1, 100_000  # zlib's level, at which a row takes 4 bytes; rows of a piece
-# Share of the cycles that may have met no part; if more have so little vacuum, it is a fault.
-MOST_WITHOUT_PART = 0.5
+# Share of the cycles that may have met no part. If more have so little vacuum, or the last LASTING
+# cycles have, it is a fault.
+MOST_WITHOUT_PART, LASTING = 1.0 / 3.0, 2
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles; largest, in rows
 
 Phases = npt.NDArray[np.uint8]
@@ -682,10 +683,15 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         saturated += int(np.count_nonzero(cycle.samples["quality"] & OVERFLOW))
     seconds = (np.array(begins, np.int64) - base.begin_ns).astype(np.float64) * NS
     share = saturated / max(rows, 1)
-    if len(without_part) > MOST_WITHOUT_PART * len(packed):
-        without_part = []
+    without_part = _now_and_then(without_part, len(packed))
     judged = [cycle for cycle in judged if cycle not in without_part]
     return LogCycles(base, seconds, judged, figures_of_cycles, share, packed, without_part)
+
+
+def _now_and_then(cycles: list[int], total: int) -> list[int]:
+    """``cycles``, or none of them if they are many of the ``total``, or last until its end."""
+    lasts = set(range(total - LASTING, total)) <= set(cycles)
+    return [] if lasts or len(cycles) > MOST_WITHOUT_PART * total else cycles
 
 
 def _packed(samples: Samples, ticks: Ticks) -> list[bytes]:
