@@ -100,3 +100,13 @@ def test_little_vacuum_in_many_cycles_or_until_the_end_is_a_fault(numbers: tuple
 def test_a_vessel_meets_no_part_in_any_cycle() -> None:
     log = read_cycles(typed("test_rig"), [with_empty_picks("test_rig", (3,))])
     assert log.without_part == []
+
+
+@pytest.mark.parametrize("numbers", [(2, 4, 5, 7), (-2, -1)])
+def test_little_vacuum_in_many_suctions_or_until_the_end_is_told_otherwise(
+    numbers: tuple[int, ...],
+) -> None:
+    """As a unit of measurement that changes within the record."""
+    suctions = len(suctions_of(log_of(NAME)))
+    samples = with_empty_picks(NAME, tuple(number % suctions for number in numbers))
+    assert without_empty_picks(typed(NAME).data, samples)[0] is samples

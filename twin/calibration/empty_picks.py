@@ -5,12 +5,11 @@ so a few of them would hide all that a fit leaves, and later all that a fault ch
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from twin.calibration.readings import Stretch, stretches
 from twin.model.dataset import DataSet
 from twin.model.parts import Cups
-from twin.monitor.cycles import OPEN_CUPS
+from twin.monitor.cycles import OPEN_CUPS, now_and_then
 from twin.quality import UNUSABLE
 from twin.signals import Command, Samples
 
@@ -18,7 +17,7 @@ FEWEST = 3  # suctions, to know what is usual
 
 
 def without_empty_picks(data: DataSet, samples: Samples) -> tuple[Samples, int]:
-    """``samples`` without cycles in which no part was met, and how many these were.
+    """``samples`` without cycles in which no part was met now and then, and how many these were.
 
     Before and after such a cycle the cups are open, so the rows after it follow on those before.
     """
@@ -27,23 +26,22 @@ def without_empty_picks(data: DataSet, samples: Samples) -> tuple[Samples, int]:
     ]
     if not any(isinstance(part, Cups) for part in data.system.parts) or len(suctions) < FEWEST:
         return samples, 0
-    is_empty = _are_empty(samples, suctions)
-    if not is_empty.any():
+    empty = now_and_then(_empty(samples, suctions), len(suctions))
+    if not empty:
         return samples, 0
     ends = [*(suction.first for suction in suctions[1:]), len(samples)]
     joined = samples.copy()
     kept = np.ones(len(samples), np.bool_)
-    for suction, end, empty in zip(suctions, ends, is_empty.tolist(), strict=True):
-        if not empty:
-            continue
-        kept[suction.first : end] = False
+    for number in empty:
+        first, end = suctions[number].first, ends[number]
+        kept[first:end] = False
         for clock in ("time_ns", "sequence") if end < len(samples) else ():
-            joined[clock][end:] -= samples[clock][end] - samples[clock][suction.first]
-    return joined[kept], int(is_empty.sum())
+            joined[clock][end:] -= samples[clock][end] - samples[clock][first]
+    return joined[kept], len(empty)
 
 
-def _are_empty(samples: Samples, suctions: list[Stretch]) -> npt.NDArray[np.bool_]:
-    """Which suctions stay far above the pressure that others reach in the same time."""
+def _empty(samples: Samples, suctions: list[Stretch]) -> list[int]:
+    """Numbers of the suctions that stay far above the pressure of others after the same time."""
     usable = ((samples["quality"] & UNUSABLE) == 0) & np.isfinite(samples["pressure"])
     pressure = np.where(usable, samples["pressure"].astype(np.float64), np.inf)
     ambient = float(np.median([pressure[suction.first] for suction in suctions]))
@@ -56,4 +54,4 @@ def _are_empty(samples: Samples, suctions: list[Stretch]) -> npt.NDArray[np.bool
         others = [curve[last] for curve in lowest if len(curve) > last]
         return bool(ambient - lowest[number][-1] < OPEN_CUPS * (ambient - np.median(others)))
 
-    return np.array([is_empty(number) for number in range(len(suctions))], np.bool_)
+    return [number for number in range(len(suctions)) if is_empty(number)]

@@ -208,7 +208,7 @@ def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:
     command = np.where(
         commands & Command.BLOW_OFF, int(Command.BLOW_OFF), commands & Command.SUCTION
     )
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(command)) + 1, [len(command)]])
+    edges = np.unique([0, *(np.flatnonzero(np.diff(command)) + 1), len(command)])
     for first, last in pairwise(edges.tolist()):
         yield Stretch(int(command[first]), first, last)
 

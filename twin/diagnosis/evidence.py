@@ -32,7 +32,7 @@ from twin.model.plant import reading_of, sensed_of
 from twin.model.term import Term, Terms
 from twin.model.theta import Theta
 from twin.monitor.bins import Bins, Floats, Ints, binned
-from twin.monitor.cycles import cut, figures, met_no_part
+from twin.monitor.cycles import cut, figures, met_no_part, now_and_then
 from twin.monitor.detector_window import detector_of, select_window
 from twin.monitor.healthy import Healthy
 from twin.monitor.measured_supply import is_gauge, lower_by
@@ -63,9 +63,6 @@ OVERFLOW = int(Quality.OVERFLOW)  # a plain number: NumPy compares bytes with it
 CORES: ContextVar[int] = ContextVar("CORES", default=2)  # number of cores for a diagnosis
 NEARBY = 0.1  # sigmas of a data set's uncertainty within which the response is linear
 FASTEST, PIECE = 1, 100_000  # zlib's level, at which a row takes 4 bytes; rows of a piece
-# Share of the cycles that may have met no part. If more have so little vacuum, or the last LASTING
-# cycles have, it is a fault.
-MOST_WITHOUT_PART, LASTING = 1.0 / 3.0, 2
 LATER, LONGEST_SUCTION = 1.3, 10_000  # simulated suction over that of cycles; largest, in rows
 
 Phases = npt.NDArray[np.uint8]
@@ -683,15 +680,9 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         saturated += int(np.count_nonzero(cycle.samples["quality"] & OVERFLOW))
     seconds = (np.array(begins, np.int64) - base.begin_ns).astype(np.float64) * NS
     share = saturated / max(rows, 1)
-    without_part = _now_and_then(without_part, len(packed))
+    without_part = now_and_then(without_part, len(packed))
     judged = [cycle for cycle in judged if cycle not in without_part]
     return LogCycles(base, seconds, judged, figures_of_cycles, share, packed, without_part)
-
-
-def _now_and_then(cycles: list[int], total: int) -> list[int]:
-    """``cycles``, or none of them if they are many of the ``total``, or last until its end."""
-    lasts = set(range(total - LASTING, total)) <= set(cycles)
-    return [] if lasts or len(cycles) > MOST_WITHOUT_PART * total else cycles
 
 
 def _packed(samples: Samples, ticks: Ticks) -> list[bytes]:

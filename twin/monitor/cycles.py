@@ -1,7 +1,7 @@
 """Cycles cut out of the stream, and the figures of each."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -25,6 +25,9 @@ _NAMES = tuple((int(phase), phase.name.lower()) for phase in Phase)
 MEASURED = ("max_vacuum", "t0_measured")  # the ``figures`` that need no model
 # Share of the usual vacuum that open cups do not reach: they draw 5 to 25 %. Leaks leave more.
 OPEN_CUPS = 1.0 / 3.0
+# Share of the cycles that may have met no part. If more have so little vacuum, or the last LASTING
+# cycles have, something is wrong: a fault, or the unit of measurement.
+MOST_WITHOUT_PART, LASTING = 1.0 / 3.0, 2
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient, to which the founding paper times evacuation
 
 
@@ -219,6 +222,12 @@ def met_no_part(cycle: Cycle, theta: Theta) -> bool:
     expected = np.fmin.reduce(cycle.ticks["expected"], initial=np.nan)
     ambient = float(theta[c.AMBIENT])
     return bool(ambient - float(lowest) < OPEN_CUPS * (ambient - float(expected)))
+
+
+def now_and_then(without_part: Sequence[int], total: int) -> list[int]:
+    """Cycles that met no part, or none if they are many of the ``total``, or last until its end."""
+    lasts = set(range(total - LASTING, total)) <= set(without_part)
+    return [] if lasts or len(without_part) > MOST_WITHOUT_PART * total else list(without_part)
 
 
 def time_to_vacuum(
