@@ -134,11 +134,11 @@ def test_assets_go_out_as_the_ending_says(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 LONG = {
-    "export LOG -o rows.csv": "exporting (samples)",
-    "compare LOG LOG": "reading good.mcap (samples)",
-    "log check LOG": "checking (samples)",
-    "log recover LOG -o whole.mcap": "recovering (samples)",
-    "figures show LOG": "reading off the curve (samples)",
+    "export LOG -o rows.csv": "exporting: 0 rows",
+    "compare LOG LOG": "reading good.mcap: 0 rows",
+    "log check LOG": "checking: 0 rows",
+    "log recover LOG -o whole.mcap": "recovering: 0 rows",
+    "figures show LOG": "reading off the curve: 0 rows",
     "figures costs LOG": "key figures of good.mcap",
     "figures savings LOG": "predicting other settings",
     "export-fmu --config CONFIG --sources-only": "translating the model to C",
@@ -208,7 +208,7 @@ def test_progress_is_coloured_unless_no_color_says_otherwise(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     shown = seen("export", log, "-o", tmp_path / "rows.csv")
-    assert "exporting (samples)" in shown
+    assert "exporting: 0 rows" in shown
     assert bool(re.search(r"\x1b\[(\d+;)*3\d", shown)) == (not environment)  # a colour (SGR)
 
 
