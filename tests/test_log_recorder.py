@@ -258,23 +258,28 @@ def test_a_live_log_is_small(tmp_path: Path, step: float, limit: float) -> None:
 # Time: what is flushed and synced when.
 
 
-def test_nothing_is_held_back_for_longer_than_a_quarter_second(tmp_path: Path) -> None:
-    samples, ticks = course(300)
+def test_nothing_is_held_back_for_longer_than_a_quarter_second_and_the_first_rows_not_at_all(
+    tmp_path: Path,
+) -> None:
+    samples, ticks = course(400)
     clock = Clock()
     path = tmp_path / "a.mcap"
     with Recorder(path, HEADER, clock=clock) as recorder:
         clock.now = 0.1
         recorder.write(samples[:100], ticks[:100])
-        assert rows_of(open_log(path))[0] == b""
-        clock.now = 0.25
-        recorder.write(samples[100:200], ticks[100:200], EVENTS[:1])
+        assert rows_of(open_log(path))[0] == samples[:100].tobytes()
+        clock.now = 0.2
+        recorder.write(samples[100:200], ticks[100:200])
+        assert rows_of(open_log(path))[0] == samples[:100].tobytes()
+        clock.now = 0.4
+        recorder.write(samples[200:300], ticks[200:300], EVENTS[:1])
         log = open_log(path)
         assert not log.complete
-        assert rows_of(log)[0] == samples[:200].tobytes()
+        assert rows_of(log)[0] == samples[:300].tobytes()
         assert list(log.events()) == EVENTS[:1]
-        clock.now = 0.26
-        recorder.write(samples[200:], ticks[200:])
-        assert rows_of(open_log(path))[0] == samples[:200].tobytes()
+        clock.now = 0.41
+        recorder.write(samples[300:], ticks[300:])
+        assert rows_of(open_log(path))[0] == samples[:300].tobytes()
         recorder.write(samples[:0], ticks[:0])  # the PLC has nothing: no reason to wait
         assert rows_of(open_log(path))[0] == samples.tobytes()
 

@@ -1,6 +1,7 @@
 """The log as a sink of the live loop."""
 
 import errno
+import math
 import os
 import shutil
 import time
@@ -52,7 +53,8 @@ class Recorder:
         self._header = header
         self._rotate_bytes = rotate_bytes
         self._clock = clock
-        self._flushed = self._synced = clock()
+        self._synced = clock()
+        self._flushed = -math.inf  # the first rows are in the file at once: it is seen to record
         self._scalars = Scalars(header.ambient)
         # Rows and events (with ns of receipt) arrive here and are laid out as messages. They are
         # dropped once a whole chunk with them is in the file.
@@ -163,10 +165,12 @@ class Recorder:
             self._flush(now)
 
     def _flush(self, now: float) -> None:
+        has_rows = bool(self._blocks)
         self._lay_out()
         self._writer.flush()
         self._forget_saved()
-        self._flushed = now
+        if has_rows:
+            self._flushed = now
         if now - self._synced >= SYNC_S:
             self._output.sync()
             self._synced = now
