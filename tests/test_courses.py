@@ -144,7 +144,7 @@ def test_added_volume_joins_with_gas_in_the_vessels_own_state(volume: float) -> 
 
 
 @pytest.mark.parametrize("span_s", [5.0, 3600.0])
-def test_a_ramp_grows_by_less_than_noise_at_once(span_s: float) -> None:
+def test_a_ramp_grows_in_small_steps_however_long_the_log_is(span_s: float) -> None:
     """Also in a log of seconds: each step would otherwise look like a switching of something."""
     theta, rows = rigs.theta("test_rig"), 20_000
     seconds = np.linspace(0.0, span_s, rows)

@@ -16,7 +16,7 @@ from twin.model.theta import Theta
 
 HOUR = 3600.0  # s
 # Steps of a ramp's coefficients from its onset to the last row, each to the value in mid-step. So a
-# step is 0.5 % of what the ramp reaches: below noise, also in a log of seconds.
+# step is 0.5 % of what the ramp reaches, whether the log is of seconds or of hours. Chosen.
 RAMP_STEPS = 200
 
 # Coefficients over time: pairs of a first row and the coefficients from it on, beginning at row 0.
