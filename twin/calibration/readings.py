@@ -208,8 +208,9 @@ def stretches(commands: npt.NDArray[np.uint8]) -> Iterator[Stretch]:
     command = np.where(
         commands & Command.BLOW_OFF, int(Command.BLOW_OFF), commands & Command.SUCTION
     )
-    edges = np.unique([0, *(np.flatnonzero(np.diff(command)) + 1), len(command)])
-    for first, last in pairwise(edges.tolist()):
+    changes = (np.flatnonzero(np.diff(command)) + 1).tolist()
+    edges = [0, *changes, len(command)] if len(command) else []
+    for first, last in pairwise(edges):
         yield Stretch(int(command[first]), first, last)
 
 
