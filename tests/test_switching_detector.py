@@ -16,6 +16,7 @@ from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import apply
+from twin.monitor import simulated_switching
 from twin.monitor.detector_window import (
     LONGEST_WINDOW,
     detector_of,
@@ -540,3 +541,23 @@ def test_by_each_law_the_detector_knows_how_far_the_end_pressure_is_away() -> No
     pivots, moves = (apply(theta, "end_vacuum_loss", law) for law in laws)
     longest = expected_detector(pivots, 30.0).longest
     assert expected_detector(moves, 30.0).longest == pytest.approx(longest, rel=0.3)
+
+
+@pytest.mark.parametrize(("break_row", "late"), [(70, None), (1003, 3), (1080, 80), (1900, None)])
+def test_a_breakpoint_far_from_the_valves_action_is_not_the_simulated_switching(
+    break_row: int, late: int | None
+) -> None:
+    """A line that rings as suction begins can show one."""
+    phase = np.full(2000, Phase.SUCTION, np.uint8)
+    theta = coefficients(DataSet()).copy()
+    theta[[c.SENSOR_LAG, c.SLOW_SENSOR]], theta[c.RESPONSE_OFF] = 0.0, 10.0 * MS
+    phase[990:] = Phase.HOLD  # the valve acts in row 1000
+    run = simulated_switching._Run(theta, phase, phase, np.full(2000, 5e4), MS)
+    detected, level = np.full(2000, Phase.SUCTION, np.uint8), np.full(2000, np.nan)
+    detected[break_row:], level[break_row] = Phase.HOLD, 5.1e4
+    vacuum, rows, above = simulated_switching._first_switching(run, detected, level, Phase.HOLD)
+    if late is None:
+        assert np.isnan(vacuum)
+        assert (rows, above) == (0, 0.0)
+    else:
+        assert (rows, above) == (late, 1e3)

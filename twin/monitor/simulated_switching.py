@@ -24,7 +24,7 @@ from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples
 IDLE_ROWS = 50  # idle rows before the cycle
 FALLS = 3.0  # times the noise; while a line rings, readings fall back by more
 COPIES = 4  # cycles of the simulated record: breakpoints of a record are aligned together
-LATEST = 100.0 * MS  # s, longest delay of a breakpoint after the valve's action
+LATEST = 100.0 * MS  # s, longest delay of a breakpoint after the valve's action, by a quick sensor
 Bytes = npt.NDArray[np.uint8]
 _OTHER = {Phase.HOLD: Phase.SUCTION, Phase.SUCTION: Phase.HOLD}
 _RESPONSES = {Phase.HOLD: c.RESPONSE_OFF, Phase.SUCTION: c.RESPONSE}
@@ -131,6 +131,11 @@ class _Run(NamedTuple):
         """A time of the coefficients, in rows."""
         return round(float(self.theta[coefficient]) / self.period)
 
+    @property
+    def latest(self) -> float:
+        """Longest delay (s) of a breakpoint after the valve's action."""
+        return LATEST + 2.0 * float(self.theta[c.SENSOR_LAG] + self.theta[c.SLOW_SENSOR])
+
     def acts(self, name: Phase) -> float:
         """Time (s) at which the valve first acts after the control switched; NaN if it does not."""
         switched = _switched(self.control, name)
@@ -152,17 +157,26 @@ def _detect(samples: Samples, run: _Run, detector: DetectorSettings) -> Detected
 def _first_switching(
     run: _Run, detected: Bytes, level: Floats, name: Phase
 ) -> tuple[float, int, float]:
-    """Vacuum, rows and level above the reading, for the first switching into ``name``."""
+    """Vacuum, rows and level above the reading, for the first switching into ``name``.
+
+    A breakpoint far from the valve's action is none of the switching's: a line that rings as
+    suction begins can show one.
+    """
     switched, before = _switched(run.phase, name) + 1, _OTHER[name]
+    if not len(switched):
+        return np.nan, 0, 0.0
+    acts = int(switched[0]) + run.rows(_RESPONSES[name])
     break_rows = np.flatnonzero(np.isfinite(level) & (detected == name))
     break_rows = break_rows[
-        np.isin(detected[break_rows - 1], (before, name)) & (break_rows > IDLE_ROWS + 1)
+        np.isin(detected[break_rows - 1], (before, name))
+        & (break_rows > IDLE_ROWS + 1)
+        & (np.abs(break_rows - acts) * run.period <= run.latest)
     ]
-    if not len(switched) or not len(break_rows):
+    if not len(break_rows):
         return np.nan, 0, 0.0
-    rows = int(break_rows[0] - switched[0] - run.rows(_RESPONSES[name]))
-    vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[break_rows[0]]) / MBAR
-    return float(vacuum), rows, float(level[break_rows[0]] - run.expected[break_rows[0]])
+    first = int(break_rows[0])
+    vacuum = (run.theta[c.AMBIENT_NOMINAL] - level[first]) / MBAR
+    return float(vacuum), first - acts, float(level[first] - run.expected[first])
 
 
 def _switched(phase: Bytes, name: Phase) -> Ints:
