@@ -166,6 +166,16 @@ def test_a_gain_that_is_sure_but_next_to_nothing_names_no_cause(
     assert confirmed(leak, *leak.hypothesis) == ()
 
 
+def test_weather_that_reduces_no_unseen_deviation_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its weights are wide: in sigmas it can gain by them alone."""
+    monkeypatch.setattr(search_module, "_weather_gain", lambda *_: (50.0, 100.0))
+    monkeypatch.setattr(search_module, "_sizes_of_causes", lambda *_: [1.0])
+    weather = Cause("ambient_pressure", {"shift": -10.0})
+    assert confirmed(of(record(27.0, seed=24)), weather) == ()
+    (kept,) = confirmed(of(record(27.0, "ambient_pressure=-25", seed=24)), weather)
+    assert kept.values["shift"] == pytest.approx(-25.0, abs=6.0)
+
+
 def test_where_nothing_is_found_all_cycles_judge_the_twin() -> None:
     for samples, is_consistent in (
         (record(27.0, seed=24), True),

@@ -22,6 +22,7 @@ from twin.diagnosis.evidence import (
     at_once,
 )
 from twin.diagnosis.fit import Fitted, fit, interval, profiled, white
+from twin.diagnosis.held_out import reduces
 from twin.diagnosis.hypotheses import (
     bounds,
     by_each_law,
@@ -268,17 +269,22 @@ def _weather_or_rival(
     Weather may be first by its prior alone. A rival must be better than weather by two pictures:
     with weights about each of them, and with those about the rival for both. By those about
     weather, which are wide, a rival would share in what only weather leaves open; and that width
-    must not be all that speaks against weather. A rival must be confirmed on held-out cycles, as
-    weather was.
+    must not be all that speaks against weather. Nor must it be all that speaks for weather: where a
+    rival leaves but noise, and less in millibars than weather, the weights about the rival decide.
+    A rival must be confirmed on held-out cycles, as weather was.
     """
+    held_out = [cycle for cycle in evidence.judged if cycle not in fitted]
 
     def compared(rival: Fitted) -> tuple[_Found, float]:
         """The rival refitted, and its score less that of weather."""
         candidate = _about(evidence, fitted, rival.hypothesis)
-        (there,) = fit(evidence, candidate.weights, [weather.found.hypothesis])
-        own = candidate.found.score + candidate.weights.volume
+        found, of_weather = candidate.found, weather.found.hypothesis
+        (there,) = fit(evidence, candidate.weights, [of_weather])
+        if found.leftover < QUIET and reduces(evidence, held_out, of_weather, found.hypothesis):
+            return candidate, found.score - there.score
+        own = found.score + candidate.weights.volume
         own -= weather.found.score + weather.weights.volume
-        return candidate, max(own, candidate.found.score - there.score)
+        return candidate, max(own, found.score - there.score)
 
     def tempered(entry: tuple[_Found, float]) -> float:
         candidate, behind = entry
@@ -677,6 +683,9 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         alternatives = fit(evidence, weights, without) if without[0] else []
         without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
         if _is_weather_alone(found):
+            # Its weights are wide: what the twin is off can count as left open, and no more.
+            if not reduces(evidence, held_out, HEALTHY, found.hypothesis):
+                return None
             gains = [_weather_gain(evidence, unseen, found.hypothesis)]
         else:
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
