@@ -162,13 +162,14 @@ def test_a_gain_that_is_sure_but_next_to_nothing_names_no_cause(
 ) -> None:
     """What acts in one cycle that was fitted shows in the unseen ones by rounding alone."""
     leak = with_leak()
-    monkeypatch.setattr(search_module, "held_out_gain", lambda *_: (0.0003, 0.0088))
+    for name in ("held_out_gain", "_gain_by_own_weights"):
+        monkeypatch.setattr(search_module, name, lambda *_: (0.0003, 0.0088))
     assert confirmed(leak, *leak.hypothesis) == ()
 
 
 def test_weather_that_reduces_no_unseen_deviation_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its weights are wide: in sigmas it can gain by them alone."""
-    monkeypatch.setattr(search_module, "_weather_gain", lambda *_: (50.0, 100.0))
+    monkeypatch.setattr(search_module, "_gain_by_own_weights", lambda *_: (50.0, 100.0))
     monkeypatch.setattr(search_module, "_sizes_of_causes", lambda *_: [1.0])
     weather = Cause("ambient_pressure", {"shift": -10.0})
     assert confirmed(of(record(27.0, seed=24)), weather) == ()
@@ -750,13 +751,42 @@ def test_a_rival_is_scored_by_weights_about_itself() -> None:
     assert second is poorer
 
 
+def test_a_replaced_cause_that_could_not_be_rejected_remains_a_rival() -> None:
+    leak = with_leak()
+    assert leak.search
+    assert leak.search.found
+    found = leak.search.found
+    other = replace(found, hypothesis=(Cause("suction_loss", {"loss": 8.0}),))
+    (kept,) = search_module._still_rivals(found, [], [(other, 5.0)])
+    assert kept.effects == ("suction_loss",)
+    assert kept.score == found.score + 5.0
+    assert search_module._still_rivals(found, [], [(other, 50.0)]) == []  # it was rejected
+    assert search_module._still_rivals(found, [kept], [(other, 5.0)]) == []  # it is there
+
+
+def test_what_is_likelier_by_wide_weights_alone_is_no_rival() -> None:
+    """In millibars the leak is nearer to the log than another supply pressure."""
+    leak = with_leak()
+    assert leak.search
+    assert leak.search.found
+    found, evidence = leak.search.found, leak.evidence
+    cycles = [cycle for cycle in evidence.judged if cycle not in leak.held_out]
+    supply = replace(found, hypothesis=(Cause("supply_pressure_drop", {"drop": 0.3}),))
+    likelier, poorer = (replace(supply, score=found.score + more) for more in (-20.0, 2.0))
+    assert search_module._without_wide(evidence, cycles, found, [likelier]) == []
+    assert search_module._without_wide(evidence, cycles, found, [poorer]) == [poorer]
+    same = replace(found, score=found.score - 20.0)
+    assert search_module._without_wide(evidence, cycles, found, [same]) == [same]
+
+
 def test_a_cause_does_not_stand_where_a_better_one_does_not_hold_in_unseen_cycles(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     evidence = collect(CONFIG, record(27.0, "leakage=1.7", seed=21))
     fitted = evidence.judged[::2]
     both = (Cause("leakage", {"sonic_flow": 1.7}), Cause("response_delay", {"delay": 0.5}))
-    rival = Fitted((Cause("slow_ramp_up", {}),), np.ones(1), np.eye(1), 100.0, -1e9, 150)
+    slow = Cause("slow_ramp_up", {"time_constant": 0.5})
+    rival = Fitted((both[0], slow), np.ones(2), np.eye(2), 100.0, -1e9, 150)
 
     def rivals(*given: Any) -> list[list[Fitted]]:
         found = given[3]
@@ -764,13 +794,16 @@ def test_a_cause_does_not_stand_where_a_better_one_does_not_hold_in_unseen_cycle
 
     monkeypatch.setattr(search_module, "_rivals", rivals)
     monkeypatch.setattr(search_module, "_confirmed", lambda *_: None)
-    found = search_module._beside_rivals(
-        evidence, fitted, _about(evidence, fitted, both), list[Fitted]()
-    )
-    assert found is not None
-    assert found[0].found.effects == ("leakage",)
-    alone = _about(evidence, fitted, both[1:])
-    assert search_module._beside_rivals(evidence, fitted, alone, list[Fitted]()) is None
+
+    def left(*causes: Cause) -> tuple[str, ...] | None:
+        current = _about(evidence, fitted, causes)
+        found = search_module._beside_rivals(evidence, fitted, current, list[Fitted]())
+        return found and found[0].found.effects
+
+    assert left(*both) == ("leakage", "response_delay")  # by weights about itself it is poorer
+    monkeypatch.setattr(search_module, "_by_own_weights", lambda *given: (given[2], rival))
+    assert left(*both) == ("leakage",)
+    assert left(both[1]) is None
 
 
 def test_a_cause_that_became_too_small_beside_another_is_dropped() -> None:

@@ -88,7 +88,7 @@ def _mean_squares(deviations: Sequence[Floats]) -> Floats:
 def reduces(
     evidence: Evidence, cycles: Sequence[int], before: Hypothesis, after: Hypothesis
 ) -> bool:
-    """Whether causes leave less deviation (mbar rms) than others in cycles of no fit.
+    """Whether causes leave less deviation (mbar rms) than others in these cycles.
 
     The 95 % interval of the reduction must lie above zero, where the cycles give one.
     """

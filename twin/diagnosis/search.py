@@ -77,6 +77,7 @@ START_OF_TIMES = np.geomspace(0.4, 40.0, 13)
 
 Progress = Callable[[str], None]
 _NO_SIZES = np.empty(0), np.empty(0)
+_NO_GAIN = 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -222,16 +223,21 @@ def _beside_rivals(
 
     A rival that is likelier replaces what was found, if it is confirmed on held-out cycles and
     likelier by weights about itself as well: those about what was found are one picture. If it is
-    clearly better and not confirmed, no listed effect acts there, and both are dropped; so are
-    they if it is weather, which is within what a healthy twin allows. None if no cause remains.
+    clearly better by both and not confirmed, no listed effect acts there, and both are dropped; so
+    are they if it is weather, which is within what a healthy twin allows. None if no cause remains.
+
+    A rival that is likelier by what weights leave open alone is none. A single cause that was
+    replaced remains a rival where the weights about it could not reject it.
     """
-    visited = set[frozenset[tuple[str, Course]]]()
+    visited, replaced = set[frozenset[tuple[str, Course]]](), list[tuple[Fitted, float]]()
     while True:
         current = _with_fine_steps(evidence, current)
         visited.add(current.found.kind)
         rivals = _rivals(evidence, current.judged, current.weights, current.found, singles)
         if _is_weather_alone(current.found):
             return _weather_or_rival(evidence, fitted, current, rivals[0])
+        rivals = [_without_wide(evidence, fitted, current.found, of_cause) for of_cause in rivals]
+        rivals[0] += _still_rivals(current.found, rivals[0], replaced)
         better = _likelier(evidence, current.found, rivals)
         if better is None:
             return current, rivals
@@ -241,12 +247,15 @@ def _beside_rivals(
         confirmed = _confirmed(
             evidence, fitted, replace(current, found=better, known=residual_covariance)
         )
+        candidate, by_own_weights = _by_own_weights(evidence, fitted, current, better)
         clearly = _is_clearly_better(better, current.found)
-        if confirmed is better:
-            candidate, by_own_weights = _by_own_weights(evidence, fitted, current, better)
-            if clearly or _likelier(evidence, current.found, [[by_own_weights]]):
-                current = candidate
-                continue
+        if confirmed is better and (
+            clearly or _likelier(evidence, current.found, [[by_own_weights]])
+        ):
+            replaced.append((current.found, current.found.score - better.score))
+            current = candidate
+            continue
+        clearly &= _is_clearly_better(by_own_weights, current.found)
         if confirmed is better or not (clearly or _is_weather_alone(better)):
             return current, _by_two_pictures(evidence, fitted, current, rivals)
         if confirmed and stranger(better, current.found) in confirmed.effects:
@@ -269,18 +278,18 @@ def _weather_or_rival(
     Weather may be first by its prior alone. A rival must be better than weather by two pictures:
     with weights about each of them, and with those about the rival for both. By those about
     weather, which are wide, a rival would share in what only weather leaves open; and that width
-    must not be all that speaks against weather. Nor must it be all that speaks for weather: where a
-    rival leaves but noise, and less in millibars than weather, the weights about the rival decide.
+    must not be all that speaks against weather. Nor must it be all that speaks for weather that
+    changes within a log: where a rival is nearer to the log, the weights about the rival decide.
     A rival must be confirmed on held-out cycles, as weather was.
     """
-    held_out = [cycle for cycle in evidence.judged if cycle not in fitted]
+    changes = weather.found.hypothesis[0].course != Course.CONSTANT
 
     def compared(rival: Fitted) -> tuple[_Found, float]:
         """The rival refitted, and its score less that of weather."""
         candidate = _about(evidence, fitted, rival.hypothesis)
-        found, of_weather = candidate.found, weather.found.hypothesis
-        (there,) = fit(evidence, candidate.weights, [of_weather])
-        if found.leftover < QUIET and reduces(evidence, held_out, of_weather, found.hypothesis):
+        found = candidate.found
+        (there,) = fit(evidence, candidate.weights, [weather.found.hypothesis])
+        if changes and _is_nearer(evidence, fitted, found, weather.found):
             return candidate, found.score - there.score
         own = found.score + candidate.weights.volume
         own -= weather.found.score + weather.weights.volume
@@ -309,6 +318,44 @@ def _weather_or_rival(
             for other in comparable
             if score_without_prior(evidence, other.score, other.hypothesis) < worst
         ]
+    ]
+
+
+def _is_nearer(evidence: Evidence, fitted: Sequence[int], candidate: Fitted, than: Fitted) -> bool:
+    """Whether a fit leaves but noise, and less in millibars than another.
+
+    In sigmas a poorer one can come out ahead, as weights about it leave open what it is off.
+    """
+    is_quiet = candidate.leftover < QUIET
+    return is_quiet and reduces(evidence, fitted, than.hypothesis, candidate.hypothesis)
+
+
+def _without_wide(
+    evidence: Evidence, fitted: Sequence[int], found: Fitted, rivals: Sequence[Fitted]
+) -> list[Fitted]:
+    """Rivals without those that are likelier than what was found, which is nearer to the log."""
+    return [
+        rival
+        for rival in rivals
+        if _likelier(evidence, found, [[rival]]) is None
+        or not _is_nearer(evidence, fitted, found, rival)
+    ]
+
+
+def _still_rivals(
+    found: Fitted, rivals: Sequence[Fitted], replaced: Sequence[tuple[Fitted, float]]
+) -> list[Fitted]:
+    """Single causes that were replaced, and that the log could not reject by weights about them.
+
+    Each comes with its score less that of what took its place.
+    """
+    present = {found.effects, *(rival.effects for rival in rivals)}
+    return [
+        replace(earlier, score=found.score + behind)
+        for earlier, behind in replaced
+        if len(found.hypothesis) == len(earlier.hypothesis) == 1
+        and earlier.effects not in present
+        and behind < CHI2_999 * max(earlier.leftover**2, 1.0)
     ]
 
 
@@ -410,8 +457,9 @@ def _likeliest(
     """Single causes, the likeliest first, each with weights about itself and their log-determinant.
 
     Scatter moves with the causes: a valve's half millisecond acts where a delay of ten has put the
-    edge. All judged cycles choose the course, the fitted ones the effect. Weather comes first if
-    the log cannot reject it against the best: it changes every week.
+    edge. All judged cycles choose the course, the fitted ones the effect. One that is nearer to the
+    log than the likeliest comes first. So does weather if the log cannot reject it against the
+    best: it changes every week.
     """
     if not (singles[0].leftover > QUIET or _weather(evidence, singles)):
         return list(singles)
@@ -444,7 +492,11 @@ def _likeliest(
     for weather in _weather(evidence, order):
         if best[weather.effects][1] < least + CHI2_999 * max(best_fit.leftover**2, 1.0):
             return [weather, *(candidate for candidate in order if candidate is not weather)]
-    return order
+    first = order[0]
+    for candidate in order[1:]:
+        if _is_nearer(evidence, fitted, candidate, first):
+            first = candidate
+    return [first, *(candidate for candidate in order if candidate is not first)]
 
 
 def _with_weather_weights(
@@ -681,14 +733,11 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
             for left_out in range(len(found.hypothesis))
         ]
         alternatives = fit(evidence, weights, without) if without[0] else []
-        without = [alternative.hypothesis for alternative in alternatives] or [HEALTHY]
-        if _is_weather_alone(found):
-            # Its weights are wide: what the twin is off can count as left open, and no more.
-            if not reduces(evidence, held_out, HEALTHY, found.hypothesis):
-                return None
-            gains = [_weather_gain(evidence, unseen, found.hypothesis)]
-        else:
+        without = [alternative.hypothesis for alternative in alternatives]
+        if alternatives:
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
+        else:
+            gains = [_gain_alone(evidence, unseen, found)]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(evidence, found)
         if min(sizes_found) < (SMALLEST_MORE if alternatives else SMALLEST):
@@ -716,17 +765,32 @@ def held_out_gain(
     return gain - reach, gain + reach
 
 
-def _weather_gain(
-    evidence: Evidence, unseen: ResidualWhitener, weather: Hypothesis
-) -> tuple[float, float]:
-    """``held_out_gain`` of weather, where the healthy twin has the weights about itself.
+def _gain_alone(evidence: Evidence, unseen: ResidualWhitener, found: Fitted) -> tuple[float, float]:
+    """``held_out_gain`` of a single cause, which the twin without any cause may have to itself.
 
-    By those about weather, which are wide, much of the deviation would count as left open without
-    any weather. A gain of |d|² has a sigma of 2 |d|.
+    Weights about a great cause, or about weather, are wide by what its waveform may be off. By them
+    much of the deviation would count as left open without any cause. So where the cause reduces
+    millibars, the twin without it has the weights about itself. Weather counts only there.
+    """
+    by_common_weights = held_out_gain(evidence, unseen, HEALTHY, found.hypothesis)
+    if not reduces(evidence, unseen.cycles, HEALTHY, found.hypothesis):
+        return _NO_GAIN if _is_weather_alone(found) else by_common_weights
+    by_own_weights = _gain_by_own_weights(evidence, unseen, found.hypothesis)
+    if _is_weather_alone(found):
+        return by_own_weights
+    return max(by_common_weights, by_own_weights)
+
+
+def _gain_by_own_weights(
+    evidence: Evidence, unseen: ResidualWhitener, hypothesis: Hypothesis
+) -> tuple[float, float]:
+    """``held_out_gain``, where the healthy twin has the weights about itself.
+
+    A gain of |d|² has a sigma of 2 |d|.
     """
     healthy = covariance(evidence).of(unseen.cycles)
     before = float(np.sum(white(evidence, healthy, [HEALTHY]) ** 2)) + healthy.volume
-    after = white(evidence, unseen, [weather])
+    after = white(evidence, unseen, [hypothesis])
     gain = before - float(np.sum(after**2)) - unseen.volume
     sigma = max(float(np.sqrt(np.mean(after**2))), 1.0)
     reach = SIGMAS_95 * 2.0 * math.sqrt(max(gain, 0.0)) * sigma
