@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import rigs
 from calibrations import log_of, typed
 
 from twin.calibration.calibrate import picked
 from twin.calibration.empty_picks import without_empty_picks
 from twin.calibration.readings import Stretch, stretches
 from twin.diagnosis.evidence import read_cycles
+from twin.events import Event, Kind
 from twin.signals import Command, Samples
 
 NAME = "gripper"
@@ -21,7 +23,12 @@ def suctions_of(samples: Samples) -> list[Stretch]:
 
 def with_empty_picks(name: str, numbers: tuple[int, ...]) -> Samples:
     """A record in some of whose suctions the vacuum is a tenth of what it was."""
-    samples = log_of(name).copy()
+    return emptied(log_of(name), numbers)
+
+
+def emptied(record: Samples, numbers: tuple[int, ...]) -> Samples:
+    """The same of any record."""
+    samples = record.copy()
     suctions = suctions_of(samples)
     ends = [*(suction.first for suction in suctions[1:]), len(samples)]
     for number in numbers:
@@ -110,3 +117,20 @@ def test_little_vacuum_in_many_suctions_or_until_the_end_is_told_otherwise(
     suctions = len(suctions_of(log_of(NAME)))
     samples = with_empty_picks(NAME, tuple(number % suctions for number in numbers))
     assert without_empty_picks(typed(NAME).data, samples)[0] is samples
+
+
+# Live.
+
+
+@pytest.mark.parametrize(
+    ("numbers", "is_fault"), [((), False), ((12,), False), ((9, 12), False), ((12, 13), True)]
+)
+def test_a_cycle_without_a_part_raises_no_alarm_unless_another_follows(
+    numbers: tuple[int, ...], is_fault: bool
+) -> None:
+    record, _ = rigs.recorded(NAME, 40.0, (), 11)
+    twin, monitor, told = rigs.twin(NAME), rigs.isolating(NAME), list[Event]()
+    for block in rigs.cut(emptied(record, numbers), 1000):
+        told += monitor.update(*twin.advance(block))
+    told += monitor.update(*twin.flush()) + monitor.close()
+    assert any(event.kind is Kind.DEVIATION for event in told) is is_fault

@@ -278,7 +278,7 @@ def _weather_or_rival(
     Weather may be first by its prior alone. A rival must be better than weather by two pictures:
     with weights about each of them, and with those about the rival for both. By those about
     weather, which are wide, a rival would share in what only weather leaves open; and that width
-    must not be all that speaks against weather. Nor must it be all that speaks for weather that
+    must not be all that speaks against weather. Nor may it be all the evidence of weather that
     changes within a log: where a rival is nearer to the log, the weights about the rival decide.
     A rival must be confirmed on held-out cycles, as weather was.
     """

@@ -27,6 +27,7 @@ from twin.monitor.cycles import (
     CycleView,
     KeyFigureSource,
     figures,
+    met_no_part,
 )
 from twin.monitor.gaps import gap_event
 from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
@@ -128,6 +129,7 @@ class Monitor:
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
     _farthest: float = 0.0  # largest excess (sigmas) of a cycle since the alarm was raised
     _quiet_cycles: int = 0
+    _without_part: tuple[bool, bool] = False, False  # whether the last two whole cycles met no part
     _last: LastRow = field(default_factory=LastRow)
     _fresh: LastRow = field(default_factory=LastRow)  # that is not stale
     _silences: set[int] = field(default_factory=set)  # reported, by PLC time of the row before
@@ -330,8 +332,14 @@ class Monitor:
         before, self._before = self._before, cycle
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
+        is_beside = self._is_beside_an_empty_pick(cycle)
         fit = (
-            self.judges and whole and cycle.settled and cycle.coverage >= FEWEST_SHARE and not stale
+            self.judges
+            and whole
+            and cycle.settled
+            and cycle.coverage >= FEWEST_SHARE
+            and not stale
+            and not is_beside
         )
         cycle_figures = figures(cycle, following(self.theta, cycle.samples))
         if not self.judges:  # leave out figures that depend on the model
@@ -339,6 +347,19 @@ class Monitor:
                 name: value for name, value in cycle_figures.items() if name in MEASURED
             }
         return CycleView(cycle, before, cycle_figures, fit)
+
+    def _is_beside_an_empty_pick(self, cycle: Cycle) -> bool:
+        """Whether a cycle alone met no part, or comes after one: the model has to settle then.
+
+        If one of the two cycles before met none either, something is wrong, and each is judged.
+        """
+        if not cycle.complete:
+            return False
+        has_no_part, (second_last, last) = met_no_part(cycle, self.theta), self._without_part
+        self._without_part = last, has_no_part
+        if has_no_part:
+            return not (last or second_last)
+        return last and not second_last
 
     def _conclude(
         self, view: CycleView, key_figures: CycleKeyFigures | None, scores: "CycleScores | None"
