@@ -771,10 +771,14 @@ def test_what_is_likelier_by_wide_weights_alone_is_no_rival() -> None:
     assert leak.search.found
     found, evidence = leak.search.found, leak.evidence
     cycles = [cycle for cycle in evidence.judged if cycle not in leak.held_out]
-    supply = replace(found, hypothesis=(Cause("supply_pressure_drop", {"drop": 0.3}),))
+    (cause,) = found.hypothesis
+    drop = replace(cause, effect="supply_pressure_drop", values={"drop": 0.3})
+    supply = replace(found, hypothesis=(drop,))
     likelier, poorer = (replace(supply, score=found.score + more) for more in (-20.0, 2.0))
     assert search_module._without_wide(evidence, cycles, found, [likelier]) == []
     assert search_module._without_wide(evidence, cycles, found, [poorer]) == [poorer]
+    freer = replace(likelier, hypothesis=(replace(drop, course=Course.RAMP),))
+    assert search_module._without_wide(evidence, cycles, found, [freer]) == [freer]
     same = replace(found, score=found.score - 20.0)
     assert search_module._without_wide(evidence, cycles, found, [same]) == [same]
 

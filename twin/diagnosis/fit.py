@@ -44,6 +44,11 @@ class Fitted:
         return tuple(cause.effect for cause in self.hypothesis)
 
     @property
+    def courses(self) -> tuple[Course, ...]:
+        """Courses of its causes."""
+        return tuple(cause.course for cause in self.hypothesis)
+
+    @property
     def kind(self) -> frozenset[tuple[str, Course]]:
         """Its effects with their courses, whatever their sizes and times."""
         return frozenset((cause.effect, cause.course) for cause in self.hypothesis)

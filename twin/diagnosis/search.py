@@ -322,12 +322,14 @@ def _weather_or_rival(
 
 
 def _is_nearer(evidence: Evidence, fitted: Sequence[int], candidate: Fitted, than: Fitted) -> bool:
-    """Whether a fit leaves but noise, and less in millibars than another.
+    """Whether a fit leaves but noise, and less in millibars than another of the same courses.
 
-    In sigmas a poorer one can come out ahead, as weights about it leave open what it is off.
+    In sigmas a poorer one can come out ahead, as weights about it leave open what it is off. Where
+    courses differ, so does how much their times were fitted.
     """
-    is_quiet = candidate.leftover < QUIET
-    return is_quiet and reduces(evidence, fitted, than.hypothesis, candidate.hypothesis)
+    if candidate.leftover >= QUIET or candidate.courses != than.courses:
+        return False
+    return reduces(evidence, fitted, than.hypothesis, candidate.hypothesis)
 
 
 def _without_wide(
