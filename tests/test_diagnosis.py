@@ -135,11 +135,12 @@ def test_a_healthy_record_of_a_coarse_input_with_hum_is_consistent(
     assert (answer["verdict"], answer["causes"]) == ("consistent", [])
 
 
-def confirmed(diagnosis: Diagnosis, *causes: Cause) -> Hypothesis:
+def confirmed(diagnosis: Diagnosis, *causes: Cause, by_own_weights: bool = False) -> Hypothesis:
     """What is left of causes, once they were fitted and asked for a gain on unseen cycles."""
     evidence, held_out = diagnosis.evidence, diagnosis.held_out
     cycles = [cycle for cycle in evidence.judged if cycle not in held_out]
-    left = _confirmed(evidence, cycles, _about(evidence, cycles, causes))
+    about = _about(evidence, cycles, causes)
+    left = _confirmed(evidence, cycles, about, by_own_weights=by_own_weights)
     return () if left is None else left.hypothesis
 
 
@@ -162,9 +163,20 @@ def test_a_gain_that_is_sure_but_next_to_nothing_names_no_cause(
 ) -> None:
     """What acts in one cycle that was fitted shows in the unseen ones by rounding alone."""
     leak = with_leak()
-    for name in ("held_out_gain", "_gain_by_own_weights"):
-        monkeypatch.setattr(search_module, name, lambda *_: (0.0003, 0.0088))
+    monkeypatch.setattr(search_module, "held_out_gain", lambda *_: (0.0003, 0.0088))
     assert confirmed(leak, *leak.hypothesis) == ()
+
+
+def test_a_cause_that_reduces_unseen_deviations_can_gain_by_weights_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By the weights about a great cause the twin without any is nearly as good."""
+    leak, chance = with_leak(), Cause("suction_loss", {"loss": 1.0}, Course.RAMP)
+    monkeypatch.setattr(search_module, "held_out_gain", lambda *_: (-5.0, 5.0))
+    assert confirmed(leak, *leak.hypothesis) == ()
+    (kept,) = confirmed(leak, *leak.hypothesis, by_own_weights=True)
+    assert kept.effect == "leakage"
+    assert confirmed(of(record(27.0, seed=24)), chance, by_own_weights=True) == ()
 
 
 def test_weather_that_reduces_no_unseen_deviation_is_none(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,21 +110,21 @@ def search(
     if not any(_worth(evidence, healthy, healthy, 0.0, candidate) for candidate in singles):
         return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
+    by_own_weights: tuple[_Found, list[Fitted], Fitted] | None = None
+    chi2_without = healthy + weights.volume
     for first in firsts:
-        current = _about(evidence, fitted, first.hypothesis)
-        alternatives = [
-            candidate.hypothesis for candidate in singles if candidate.effects != first.effects
-        ]
-        refitted = fit(evidence, current.weights, alternatives, best_only=True)
-        ranked = [current.found, *sorted(refitted, key=lambda candidate: candidate.score)]
-        current = _added(evidence, fitted, current, ranked, alone, progress)
+        current, ranked = _grown(evidence, fitted, first, singles, alone, progress)
         progress("asking cycles that nothing was fitted to")
         confirmed = _confirmed(evidence, fitted, current)
-        chi2_without = healthy + weights.volume
         if confirmed and _beats(evidence, chi2_without, confirmed, current.weights.volume):
             break
+        confirmed = _confirmed(evidence, fitted, current, by_own_weights=True)
+        if confirmed and _beats(evidence, chi2_without, confirmed, current.weights.volume):
+            by_own_weights = by_own_weights or (current, ranked, confirmed)
     else:
-        return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
+        if by_own_weights is None:
+            return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
+        current, ranked, confirmed = by_own_weights
     singles = ranked
     if confirmed is not current.found:
         current = _about(evidence, fitted, confirmed.hypothesis)
@@ -165,6 +165,24 @@ def _about(evidence: Evidence, fitted: Sequence[int], hypothesis: Hypothesis) ->
         weights,
         _healthy(evidence, weights),
     )
+
+
+def _grown(
+    evidence: Evidence,
+    fitted: Sequence[int],
+    first: Fitted,
+    singles: Sequence[Fitted],
+    alone: Signatures,
+    progress: Progress,
+) -> tuple[_Found, list[Fitted]]:
+    """A single cause with those found beside it, and all single causes by the weights about it."""
+    current = _about(evidence, fitted, first.hypothesis)
+    alternatives = [
+        candidate.hypothesis for candidate in singles if candidate.effects != first.effects
+    ]
+    refitted = fit(evidence, current.weights, alternatives, best_only=True)
+    ranked = [current.found, *sorted(refitted, key=lambda candidate: candidate.score)]
+    return _added(evidence, fitted, current, ranked, alone, progress), ranked
 
 
 def _added(
@@ -720,11 +738,13 @@ def _pruned(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fitte
     return found
 
 
-def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fitted | None:
+def _confirmed(
+    evidence: Evidence, fitted: Sequence[int], current: _Found, *, by_own_weights: bool = False
+) -> Fitted | None:
     """Causes without those that are too small or do not predict held-out cycles.
 
     None if none is left. Each is left out in turn, and the others are refitted. The least certain
-    is dropped first.
+    is dropped first. A last one may gain ``by_own_weights``.
     """
     held_out = [cycle for cycle in evidence.judged if cycle not in fitted]
     found, weights, residual_covariance = current.found, current.weights, current.known
@@ -739,7 +759,7 @@ def _confirmed(evidence: Evidence, fitted: Sequence[int], current: _Found) -> Fi
         if alternatives:
             gains = [held_out_gain(evidence, unseen, fewer, found.hypothesis) for fewer in without]
         else:
-            gains = [_gain_alone(evidence, unseen, found)]
+            gains = [_gain_alone(evidence, unseen, found, by_own_weights=by_own_weights)]
         weakest = min(range(len(gains)), key=lambda left_out: gains[left_out][0])
         sizes_found = _sizes_of_causes(evidence, found)
         if min(sizes_found) < (SMALLEST_MORE if alternatives else SMALLEST):
@@ -767,20 +787,21 @@ def held_out_gain(
     return gain - reach, gain + reach
 
 
-def _gain_alone(evidence: Evidence, unseen: ResidualWhitener, found: Fitted) -> tuple[float, float]:
-    """``held_out_gain`` of a single cause, which the twin without any cause may have to itself.
+def _gain_alone(
+    evidence: Evidence, unseen: ResidualWhitener, found: Fitted, *, by_own_weights: bool
+) -> tuple[float, float]:
+    """``held_out_gain`` of a single cause over the twin without any.
 
     Weights about a great cause, or about weather, are wide by what its waveform may be off. By them
-    much of the deviation would count as left open without any cause. So where the cause reduces
-    millibars, the twin without it has the weights about itself. Weather counts only there.
+    much of the deviation would count as left open without any cause. So weather, or a cause
+    ``by_own_weights``, must reduce millibars. Then the twin without any has the weights about
+    itself.
     """
-    by_common_weights = held_out_gain(evidence, unseen, HEALTHY, found.hypothesis)
+    if not (by_own_weights or _is_weather_alone(found)):
+        return held_out_gain(evidence, unseen, HEALTHY, found.hypothesis)
     if not reduces(evidence, unseen.cycles, HEALTHY, found.hypothesis):
-        return _NO_GAIN if _is_weather_alone(found) else by_common_weights
-    by_own_weights = _gain_by_own_weights(evidence, unseen, found.hypothesis)
-    if _is_weather_alone(found):
-        return by_own_weights
-    return max(by_common_weights, by_own_weights)
+        return _NO_GAIN
+    return _gain_by_own_weights(evidence, unseen, found.hypothesis)
 
 
 def _gain_by_own_weights(
