@@ -11,7 +11,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -19,8 +18,6 @@ from pathlib import Path
 
 PEERS = Path(__file__).parent / "peers"  # programs of ours around npm packages and libmodbus
 PATIENCE_S = 60.0
-PROBES = 3  # until a program counts as missing
-ENVIRONMENT = dict(os.environ)  # no test has changed it yet
 NPM = ("npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund")
 
 
@@ -118,26 +115,15 @@ def is_here(name: str, path: str) -> bool:
     need = NEEDS[name]
     if not need.probe or not find(name, path):
         return bool(find(name, path))
-    for attempt in range(PROBES):  # a compiler that is there failed among many tests, seldom
-        time.sleep(attempt)
-        if _is_probed(need, path):
-            return True
-    return False
-
-
-def _is_probed(need: Need, path: str) -> bool:
     probed = subprocess.run(
         need.probe,
         input=need.source.encode(),
         cwd=PEERS,
-        env={**ENVIRONMENT, "PATH": path},
+        env={**os.environ, "PATH": path},
         capture_output=True,
         timeout=PATIENCE_S,
         check=False,
     )
-    if probed.returncode:
-        said = probed.stderr.decode(errors="replace").strip()
-        sys.stderr.write(f"{shlex.join(need.probe)} ended with {probed.returncode}: {said}\n")
     return probed.returncode == 0
 
 
