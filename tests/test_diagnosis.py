@@ -718,6 +718,16 @@ def test_where_the_likeliest_does_not_hold_the_search_begins_again(
     assert (cause["effect"], cause["course"]) == ("leakage", "step")
 
 
+def test_where_no_cause_gains_by_common_weights_its_own_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(search_module, "held_out_gain", lambda *_: (-5.0, 5.0))
+    (cause,) = of(record(27.0, "leakage=1.7@14.4", seed=21)).json["causes"]
+    assert (cause["effect"], cause["course"]) == ("leakage", "step")
+    monkeypatch.setattr(search_module, "_gain_by_own_weights", lambda *_: (-5.0, 5.0))
+    assert of(record(27.0, "leakage=1.7@14.4", seed=21)).json["causes"] == []
+
+
 @pytest.mark.parametrize(
     ("better_by", "likelier", "clearly"),
     [(50.0, True, True), (5.0, True, False), (-1.0, False, False)],

@@ -1,4 +1,4 @@
-"""Suctions that met no part, in a record that a unit is commissioned on."""
+"""Suctions that met no part: in commissioning, in a diagnosis and live."""
 
 import numpy as np
 import pytest

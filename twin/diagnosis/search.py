@@ -110,7 +110,7 @@ def search(
     if not any(_worth(evidence, healthy, healthy, 0.0, candidate) for candidate in singles):
         return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
     firsts = _likeliest(evidence, fitted, tried, singles, progress)[:TRIED_FIRST]
-    by_own_weights: tuple[_Found, list[Fitted], Fitted] | None = None
+    fallback: tuple[_Found, list[Fitted], Fitted] | None = None
     chi2_without = healthy + weights.volume
     for first in firsts:
         current, ranked = _grown(evidence, fitted, first, singles, alone, progress)
@@ -120,11 +120,11 @@ def search(
             break
         confirmed = _confirmed(evidence, fitted, current, by_own_weights=True)
         if confirmed and _beats(evidence, chi2_without, confirmed, current.weights.volume):
-            by_own_weights = by_own_weights or (current, ranked, confirmed)
+            fallback = fallback or (current, ranked, confirmed)
     else:
-        if by_own_weights is None:
+        if fallback is None:
             return Search(healthy_covariance, healthy, None, singles, [], _NO_SIZES, [])
-        current, ranked, confirmed = by_own_weights
+        current, ranked, confirmed = fallback
     singles = ranked
     if confirmed is not current.found:
         current = _about(evidence, fitted, confirmed.hypothesis)
@@ -744,7 +744,7 @@ def _confirmed(
     """Causes without those that are too small or do not predict held-out cycles.
 
     None if none is left. Each is left out in turn, and the others are refitted. The least certain
-    is dropped first. A last one may gain ``by_own_weights``.
+    is dropped first. ``by_own_weights`` says how a single cause may gain.
     """
     held_out = [cycle for cycle in evidence.judged if cycle not in fitted]
     found, weights, residual_covariance = current.found, current.weights, current.known
