@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.air import R
 from twin.model.dataset import DataSet, coefficients
-from twin.model.gas import R
 from twin.model.theta import Theta
 from twin.signals import MS, Phase
 

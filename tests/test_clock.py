@@ -13,7 +13,8 @@ from twin.events import Event, Kind
 from twin.log.reader import open_log
 from twin.log.recorder import Recorder
 from twin.monitor.clock import EVERY, WINDOW_NS, ClockWatch, line, slope_pm
-from twin.monitor.monitor import Monitor, MonitorSettings
+from twin.monitor.monitor import Monitor
+from twin.monitor.settings import MonitorSettings
 from twin.quality import Quality
 from twin.signals import SAMPLE, TICK, Samples
 

@@ -14,14 +14,12 @@ from twin.model import kernel
 from twin.model import theta as c
 from twin.model.control import (
     CONTINUOUS,
-    LEAK_SETTLE_S,
-    PROTECTED_S,
-    PROTECTED_SWITCHES,
     effective_commands,
     new_timer,
     nothing_done,
     switch,
 )
+from twin.model.safeguards import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.theta import Theta
 from twin.signals import MBAR, MS, Command, Phase, Signal
 

@@ -15,7 +15,7 @@ from twin.figures.text import _give_or_take, in_words, limit_of, trend_plain
 from twin.figures.trend import FARTHEST, Line, Trend, line_through, reach, trend_of
 from twin.instants import DAY_NS
 from twin.model.dataset import DataSet
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 
 TRIALS = 150
 

@@ -23,10 +23,10 @@ from twin.exchange.fmu import make_fmu
 from twin.exchange.variables import Component, Where
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.air import GAMMA, R
 from twin.model.catalogue import CatalogueEffect, Range
 from twin.model.dataset import coefficients
 from twin.model.effects import EFFECTS, apply
-from twin.model.gas import GAMMA, R
 from twin.signals import MS, SL_MIN
 
 BOUND = 0.1  # Pa

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin.model.gas import CP, CRITICAL_RATIO, GAMMA, LAMINAR_RATIO, R, opening, orifice
+from twin.model.air import CP, CRITICAL_RATIO, GAMMA, LAMINAR_RATIO, R
+from twin.model.gas import opening, orifice
 
 RATIOS = st.floats(0.0, 1.0)
 compiling = settings(deadline=None)  # the first example has to compile

@@ -17,7 +17,8 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation, Verdict
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import SUSPECTS, ModelBank, hypotheses
-from twin.monitor.monitor import Monitor, MonitorSettings
+from twin.monitor.monitor import Monitor
+from twin.monitor.settings import MonitorSettings
 from twin.signals import SAMPLE, TICK, Samples, Ticks
 
 BEGINS, CYCLES = 30, 42

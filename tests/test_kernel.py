@@ -13,7 +13,7 @@ from stepping import MASSES, PRESSURES, advance, temperature
 
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.gas import GAMMA
+from twin.model.air import GAMMA
 from twin.model.theta import Theta
 from twin.quality import BREAK, Quality
 from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tools.readme import filled
-from twin.figures import settings
+from twin.figures import expected
 from twin.figures.cycle_view import (
     LAST_S,
     LEAK_WINDOW_S,
@@ -27,11 +27,11 @@ from twin.figures.key_figures import FIGURES, Unit, figures, table
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.text import limit_of
 from twin.figures.warnings import CAUTIONS, in_words, warnings
-from twin.model.control import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, Ejector, Supply, System, Vessel
+from twin.model.safeguards import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.monitor.healthy import Healthy
 from twin.monitor.healthy import Scatter as Seen
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 from twin.signals import Phase
 
 ROOT = Path(__file__).parents[1]
@@ -594,8 +594,8 @@ def test_limits_that_are_known_need_no_simulation(monkeypatch: pytest.MonkeyPatc
         asked.append(name)
         return 100.0
 
-    monkeypatch.setattr(settings, "t1_from_rest", lambda _: noted("t1"))
-    monkeypatch.setattr(settings, "leakage_from_rest", lambda _: noted("leakage"))
+    monkeypatch.setattr(expected, "t1_from_rest", lambda _: noted("t1"))
+    monkeypatch.setattr(expected, "leakage_from_rest", lambda _: noted("leakage"))
     limits(FigureSettings(), DATA, commissioned(scatter=0.001))
     limits(
         FigureSettings(permitted_t1_ms=900.0, permitted_leakage_mbar_s=90.0),

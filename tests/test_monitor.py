@@ -12,7 +12,8 @@ from twin.events import Event, Kind, Severity
 from twin.model.effects import EFFECTS, UNKNOWN
 from twin.monitor import naming
 from twin.monitor.healthy import Healthy, Scatter
-from twin.monitor.monitor import Monitor, MonitorSettings
+from twin.monitor.monitor import Monitor
+from twin.monitor.settings import MonitorSettings
 from twin.quality import Quality
 from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Samples, Ticks
 

@@ -30,7 +30,7 @@ from stepping import (
 
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.gas import CP
+from twin.model.air import CP
 from twin.model.plant import prepare
 from twin.model.theta import Theta
 from twin.signals import MBAR, ML, MS, SL_MIN, Phase

@@ -11,8 +11,8 @@ from stepping import states, theta_of
 
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.air import CRITICAL_RATIO, VISCOSITY, R, orifice
 from twin.model.dataset import DataSet
-from twin.model.gas import CRITICAL_RATIO, VISCOSITY, R, orifice
 from twin.model.parts import (
     FRICTION,
     TUBE_LOSS,
@@ -195,7 +195,7 @@ def test_cups_count() -> None:
 def test_a_cup_that_draws_all_the_suction_has_its_free_flow_vacuum(critical: float) -> None:
     parts = tube(), cups(count=3, open=1, free_flow_mbar=8.0, release_mbar=30.0)
     of = lumped(parts, SUCTION, AMBIENT, KELVIN, critical)
-    through, _ = orifice.py_func(1.0 - 8 * MBAR / AMBIENT, critical)  # type: ignore[no-untyped-call]
+    through, _ = orifice(1.0 - 8 * MBAR / AMBIENT, critical)
     assert of.open == pytest.approx(SUCTION / (8 * MBAR))
     assert of.hole * through == pytest.approx(3 * SUCTION)
     assert of.opening == pytest.approx(3 * of.open)

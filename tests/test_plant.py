@@ -13,8 +13,8 @@ from stepping import closed, standing, states, switched_on, temperature, theta_o
 from drivers.plc.rig import bulging
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.air import GAMMA, R
 from twin.model.dataset import Ejector
-from twin.model.gas import GAMMA, R
 from twin.model.plant import (
     Driven,
     Gas,

@@ -30,7 +30,7 @@ from twin.config import TABLES, Asset, LogSettings
 from twin.errors import ConfigError
 from twin.figures.settings import FigureSettings
 from twin.model.dataset import DataSet
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 from twin.notifications.settings import (
     MqttSettings,
     NotificationSettings,

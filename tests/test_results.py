@@ -288,7 +288,7 @@ def test_beyond_it_may_be_said_that_everybody_may_read() -> None:
 
 
 def test_they_are_off_unless_they_are_switched_on() -> None:
-    with open_results([Document.read(rigs.path_of("test_rig"))], FIGURES) as sink:
+    with open_results([Document.read(rigs.path_of("test_rig"))], lambda: FIGURES) as sink:
         assert sink is None
 
 
@@ -299,7 +299,7 @@ def test_two_places_for_one_process_are_refused() -> None:
     ]
     with (
         pytest.raises(ConfigError, match=r"4841\.toml and 4842\.toml"),
-        open_results(documents, {}),
+        open_results(documents, dict),
     ):
         pass
 

@@ -1,7 +1,9 @@
 """A run on a new machine: rows are acquired while the model is compiled, and all reach the log."""
 
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +54,7 @@ def expected_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
 
 @pytest.fixture
 def nothing_cached(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Models, "_load", lambda _models: False)
+    monkeypatch.setattr(Models, "_made_from_cache", lambda _models: False)
 
 
 def compiles_by(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
@@ -212,13 +214,43 @@ def test_several_ejectors_wait_for_one_compiler(
 
 
 def test_the_plant_of_a_plc_is_there_before_it_is_asked() -> None:
-    models = Models({"gripper": rigs.config("gripper")}, ahead=False)
-    assert not models.compiling
+    models = Models({"gripper": rigs.config("gripper")}, at_once=True)
+    models.load()
     assert models.wait(0.0)
     models.take("gripper")
 
 
 # A start with all compiled.
+
+
+def test_rows_are_taken_while_a_compiled_model_is_loaded(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acquisitions: list[acquisition.Acquisition] = []
+    at_once = acquisition.Acquisition.__init__
+    from_cache = Models._made_from_cache
+
+    def begins(self: acquisition.Acquisition, *args: Any, **kwargs: Any) -> None:
+        at_once(self, *args, **kwargs)
+        acquisitions.append(self)
+
+    def takes_long(models: Models) -> bool:
+        assert acquisitions, "the model is loaded before any row is taken"
+        until = time.monotonic() + PATIENCE_S
+        while acquisitions[0]._rows < 100 and time.monotonic() < until:
+            time.sleep(0.01)
+        rows.append(acquisitions[0]._rows)
+        return from_cache(models)
+
+    rows: list[int] = []
+    monkeypatch.setattr(acquisition.Acquisition, "__init__", begins)
+    monkeypatch.setattr(Models, "_made_from_cache", takes_long)
+    log = tmp_path / "a.mcap"
+    assert twin(monkeypatch, *beside(plc, log, 1.0)) == 0
+    samples, _ = logged(log)
+    assert len(samples) > rows[0] >= 100
+    assert missing(samples) == 0
+
 
 LATER = {  # what no start needs, by what does need it
     "scipy.stats": "trends",
@@ -240,6 +272,10 @@ def test_a_start_imports_nothing_that_it_does_not_need(
         _, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert len(logged(log)[0]) > 0
-    imported = {line.rpartition("|")[2].strip() for line in said.splitlines()}
-    assert {"numba", "twin.log.recorder"} <= imported
-    assert imported & {*LATER} == set()
+    imported = [line.rpartition("|")[2].strip() for line in said.splitlines()]
+    assert {"numba", "scipy.special", "twin.log.recorder"} <= {*imported}
+    assert {*imported} & {*LATER} == set()
+    before_rows = imported[: imported.index("twin.acquisition")]
+    assert {"drivers.modbus.driver", "numpy"} <= {*before_rows}
+    assert not any(name.partition(".")[0] in ("numba", "llvmlite") for name in before_rows)
+    assert "scipy.special" not in before_rows

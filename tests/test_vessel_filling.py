@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from stepping import standing, states, temperature, theta_of
 
 from twin.model import kernel
-from twin.model.gas import GAMMA, R
+from twin.model.air import GAMMA, R
 from twin.model.theta import Theta
 from twin.signals import MBAR, SL_MIN, Phase
 

@@ -328,9 +328,13 @@ BENCHMARKS = (
     Benchmark(
         "first-row",
         first_view.row,
-        "`twin run` beside the simulated PLC, everything in the page cache, from its start until "
-        "its log holds rows.",
-        (Figure("start: twin run, first row", "ms", STARTED),),
+        "`twin run` beside the simulated PLC, everything compiled and in the page cache, from its "
+        "start: until the first row came that its log has, and until its log holds rows. The model "
+        "is loaded between the two.",
+        (
+            Figure("start: twin run, first row", "ms", STARTED, 1000.0),
+            Figure("start: twin run, first row in the log", "ms", STARTED),
+        ),
     ),
 )
 

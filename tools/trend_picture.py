@@ -22,7 +22,7 @@ from twin.figures.settings import FigureSettings, limits
 from twin.figures.text import in_words, trend_of_figure
 from twin.instants import DAY_NS
 from twin.model.dataset import DataSet
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 
 UNIT = Unit("compact-ejector-35", "gripper-01")
 WORKING_DAYS = (0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 14, 15, 16, 17, 18)

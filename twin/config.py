@@ -25,7 +25,7 @@ from twin.model.catalogue import effects_in
 from twin.model.dataset import DataSet
 from twin.model.diagram import reduce
 from twin.monitor.healthy import Healthy
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 from twin.settings import Document, Settings
 from twin.signals import MBAR
 from twin.validation import findings, path_in_words, without_tags

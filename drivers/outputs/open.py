@@ -35,7 +35,7 @@ def open_writer(
 
 @contextmanager
 def open_results(
-    documents: Sequence[Document], figures: Mapping[str, str]
+    documents: Sequence[Document], units_of_figures: Callable[[], Mapping[str, str]]
 ) -> Iterator["Callable[..., Results] | None"]:
     """Serve the results of all configurations that ask for it by one server; None if none does.
 
@@ -49,7 +49,7 @@ def open_results(
     require("opcua", "[results] over OPC UA")
     from drivers.outputs.results import ResultsServer  # noqa: PLC0415 - the library takes its time
 
-    with ResultsServer(settings, figures) as server:
+    with ResultsServer(settings, units_of_figures()) as server:
         yield server.sink
 
 

@@ -1,4 +1,4 @@
-"""Time until a browser shows the first ejector, and until a run has logged its first rows."""
+"""Time until a browser shows the first ejector, and until a run takes and logs its first rows."""
 
 import shutil
 import signal
@@ -15,6 +15,7 @@ from benchmarks.machine import TWIN_CORE, on_core
 from benchmarks.plant import KEPT, configured, served
 from benchmarks.processes import CONFIG, command, live, plc
 from benchmarks.replay import IMPORTS, STARTS, seconds_of
+from twin.log.reader import open_log
 
 VIEWS = 7
 LOOK_S = 0.005  # between looks at the log
@@ -60,22 +61,25 @@ def _view(browser: Browser, url: str) -> tuple[float, float]:
 
 
 def row(run: Run) -> Sequence[Measured]:
-    """Time (ms) of ``twin run`` until its log holds rows, by turns with the imports alone."""
+    """Times (ms) of ``twin run`` until it has a row, and until its log holds rows.
+
+    By turns with the imports alone.
+    """
     with plc() as port:
-        _until_logged(run, port)  # compiles first
+        _started(run, port)  # compiles first
         run.tell("first row")
-        pairs = [
-            (1e3 * _until_logged(run, port), 1e3 * seconds_of([sys.executable, "-c", IMPORTS]))
+        starts = [
+            (*_started(run, port), 1e3 * seconds_of([sys.executable, "-c", IMPORTS]))
             for _ in range(STARTS)
         ]
-    values, floors = zip(*pairs, strict=True)
-    return (Measured(values, floors),)
+    taken, logged, floors = zip(*starts, strict=True)
+    return Measured(taken, floors), Measured(logged, floors)
 
 
-def _until_logged(run: Run, port: int) -> float:
-    """Time (s) from the start of ``twin run`` until its log has more than its head."""
+def _started(run: Run, port: int) -> tuple[float, float]:
+    """Times (ms) from the start of ``twin run``: its first logged row came; its log has rows."""
     path = run.folder / "first row.mcap"
-    begin, sizes = time.perf_counter(), set[int]()
+    begin_ns, begin, sizes = time.time_ns(), time.perf_counter(), set[int]()
     with on_core(TWIN_CORE):
         process = subprocess.Popen(command(path, (CONFIG,), port), stdout=subprocess.DEVNULL)
     with process:
@@ -85,7 +89,8 @@ def _until_logged(run: Run, port: int) -> float:
             time.sleep(LOOK_S)
             if path.exists() and (size := path.stat().st_size):
                 sizes.add(size)
-        seconds = time.perf_counter() - begin
+        logged = 1e3 * (time.perf_counter() - begin)
         process.send_signal(signal.SIGINT)
+    first, _ = next(open_log(path).blocks())
     path.unlink()  # a log is never overwritten
-    return seconds
+    return 1e-6 * float(first["host_ns"][0] - begin_ns), logged

@@ -15,7 +15,7 @@ from twin.errors import ConfigError, SourceError, known_names
 from twin.figures.settings import FigureSettings, Limits, limits
 from twin.languages.texts import numeral, tr
 from twin.model.dataset import DataSet
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 
 
 @dataclass(frozen=True)

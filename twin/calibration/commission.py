@@ -39,9 +39,9 @@ from twin.diagnosis.text import listed, spoken
 from twin.errors import ConfigError
 from twin.languages.texts import ntr, numeral, tr
 from twin.model import theta as c
+from twin.model.air import GAMMA, R
 from twin.model.dataset import Ambient, DataSet, coefficients, sensor_place
 from twin.model.effects import standing_for
-from twin.model.gas import GAMMA, R
 from twin.model.parts import Cups, Part, Sensor, Tube, volume
 from twin.monitor.cycles import FEWEST_ROWS
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy, Scatter

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import nnls
 
-from twin.model.gas import GAMMA
+from twin.model.air import GAMMA
 
 BEGUN = 0.1  # share of the fall from which rows are used: open cups have met their part by then
 DEEP = 100e2  # Pa: the least fall of pressure

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from twin.calibration.flow_meter import Suction, stored
 from twin.figures.curve import flow_behind
-from twin.model.gas import R
+from twin.model.air import R
 from twin.monitor.breakpoints import SHARE_OF_STEP, converter_step, turns
 from twin.monitor.offline_switching import reports_nozzle, told_edges
 from twin.monitor.signal_checks import part_at

@@ -27,23 +27,27 @@ COMPILING = "compiling the model for this processor, once; recording meanwhile"
 
 
 class Models:
-    """Twin and monitor of each ejector: at once from the cache, or later, once compiled.
+    """Twin and monitor of each ejector: ``load`` takes them from the cache, or has them compiled.
 
-    Where something has to be compiled, ``compiling`` is true and a child process does it. Where
-    that fails, or nothing would be kept, ``take`` compiles. Without ``ahead`` everything has been
-    compiled here when this returns.
+    A child process compiles what has to be. Where that fails, or nothing would be kept, ``take``
+    compiles. With ``at_once`` everything has been compiled here when this returns.
     """
 
-    def __init__(self, ejectors: "Mapping[str, Config]", *, ahead: bool) -> None:
+    def __init__(self, ejectors: "Mapping[str, Config]", *, at_once: bool) -> None:
         self._ejectors = ejectors
         self._pairs: dict[str, Pair] = {}
         self._child: ChildProcess | None = None
-        self._one_at_a_time = threading.Lock()  # who takes a pair, or looks for the child
-        if not ahead:
+        self._is_loaded = False
+        self._one_at_a_time = threading.Lock()  # who loads, takes a pair, or looks for the child
+        if at_once:
             self._make_all()
-        self.compiling = ahead and not self._load()
-        if self.compiling:
-            self._start()
+
+    def load(self) -> None:
+        """Make all pairs if they are in the cache, else have them compiled; once for all."""
+        with self._one_at_a_time:
+            if not self._is_loaded and not self._made_from_cache():
+                self._start()
+            self._is_loaded = True
 
     def wait(self, seconds: float) -> bool:
         """Whether there is nothing to wait for any more; waits no longer than that."""
@@ -72,17 +76,17 @@ class Models:
         with self._one_at_a_time:
             self._close_child()
 
-    def _load(self) -> bool:
+    def _made_from_cache(self) -> bool:
         """Make all pairs if that needs no compiling."""
         from twin.model.compiled import NotCachedError, only_cached
 
         with suppress(NotCachedError), only_cached():
             self._make_all()
-            return True
-        return False
+        return self._is_loaded
 
     def _make_all(self) -> None:
         self._pairs = {name: pair_of(settings) for name, settings in self._ejectors.items()}
+        self._is_loaded = True
 
     def _start(self) -> None:
         from twin.model.compiled import expect_waiting, keeps

@@ -60,7 +60,7 @@ def sections() -> "dict[str, dict[str, type[Settings]]]":
     from twin.config import Asset, LogSettings
     from twin.figures.settings import FigureSettings
     from twin.model.dataset import DataSet
-    from twin.monitor.monitor import MonitorSettings
+    from twin.monitor.settings import MonitorSettings
     from twin.notifications.settings import (
         MqttSettings,
         NotificationSettings,

@@ -391,7 +391,7 @@ def _limits(config: Path | None) -> "Limits":
     from twin.config import Config
     from twin.figures.settings import FigureSettings, limits
     from twin.model.dataset import DataSet
-    from twin.monitor.monitor import MonitorSettings
+    from twin.monitor.settings import MonitorSettings
 
     document = _document(config)
     if document:

@@ -89,7 +89,6 @@ def run(
     from drivers.outputs.open import open_results, open_writer
     from drivers.sources import open_source
     from twin.cli.compiling import Models
-    from twin.figures.key_figures import FIGURES
     from twin.run_many import run_together
     from twin.settings import Document
 
@@ -122,11 +121,12 @@ def run(
             file = closing.enter_context(
                 _hinted(_file_of(log, label, name), complain if alone else None, hil=hil)
             )
-            # It begins with the newest row: rows that came during the start are not evaluated.
+            # From here on every row counts: what takes time comes after it.
             source = _answering(plc.blocks(), settings, writer) if writer else plc.blocks()
             rows = closing.enter_context(
-                _acquired(until(stopped, source), models.compiling, plc.listening)
+                _acquired(until(stopped, source), plc.listening, ahead=not hil)
             )
+            models.load()
             opened = live_sinks(
                 settings, consoles[name], results, file, view_of(name), complain, hil=hil
             )
@@ -146,14 +146,13 @@ def run(
             _loop(name, models, rows, plc.listening, sinks, advisers, stopped, limits)
 
     failed: list[str] = []
-    units = {figure.name: figure.unit for figure in FIGURES.values()}
-    models = Models(ejectors, ahead=not hil)  # before time counts
+    models = Models(ejectors, at_once=hil)  # then the PLC waits for the model
     with (
         closed(models),
-        open_results([settings.document for settings in ejectors.values()], units) as show,
+        open_results([settings.document for settings in ejectors.values()], _figure_units) as show,
         views_of(ejectors, view, rrd) as view_of,
         stop_on_signal(duration) as stop,
-        _gc_frozen(compiled=hil),
+        _gc_frozen(),
         Service(os.environ) as service,
         printers() as (printer, complain),
     ):
@@ -221,6 +220,13 @@ class _Plc:
         waits = "" if self._waits else f"\n  {WAITS}; with --once the run ends instead"
         self._waits = True
         self._complain(f"{self._prefix}{error}\n  {error.hint}{waits}")
+
+
+def _figure_units() -> dict[str, str]:
+    """The unit of each key figure; its module loads slowly, and only published results need it."""
+    from twin.figures.key_figures import FIGURES
+
+    return {figure.name: figure.unit for figure in FIGURES.values()}
 
 
 def _by_asset(ejectors: "Sequence[Config]") -> "dict[str, Config]":
@@ -361,7 +367,7 @@ def _answering(
 
 @contextmanager
 def _acquired(
-    source: "Iterator[Samples]", ahead: bool, listening: "Listening"
+    source: "Iterator[Samples]", listening: "Listening", *, ahead: bool
 ) -> "Iterator[Acquisition]":
     """Acquires the rows of a run, ``ahead`` of its model; ``listening`` times them."""
     from twin.acquisition import Acquisition
@@ -404,19 +410,16 @@ def _loop(
     if pair is not None:
         if limits is not None:
             limits.attach(pair[1])
+        gc.freeze()
         run(rows.blocks(), *pair, sinks, listening, advisers)
 
 
 @contextmanager
-def _gc_frozen(*, compiled: bool) -> "Iterator[None]":
-    """Exclude present objects from garbage collection: scanning them delays a block by 0.2 s.
+def _gc_frozen() -> "Iterator[None]":
+    """Exclude from garbage collection what is there when a loop begins (``_loop`` freezes it).
 
-    Only if models may have been ``compiled`` in this process there is garbage to collect before:
-    that takes a tenth of a start.
+    Scanning it would delay a block by 0.2 s.
     """
-    if compiled:
-        gc.collect()
-    gc.freeze()
     try:
         yield
     finally:

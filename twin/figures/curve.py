@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from twin.config import Config
 from twin.inference.levels import MAD_TO_SIGMA, SIGMAS_95
-from twin.model.control import LEAK_SETTLE_S
-from twin.model.gas import GAMMA, R
+from twin.model.air import GAMMA, R
 from twin.model.parts import volume
+from twin.model.safeguards import LEAK_SETTLE_S
 from twin.quality import UNUSABLE, Quality
 from twin.signals import MBAR, ML, NS, SAMPLE, SL_MIN, Command, Samples, joined
 from twin.tables.derive import shortest_half

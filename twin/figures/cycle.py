@@ -15,7 +15,7 @@ from twin.figures.settings import FigureSettings, Limits, limits
 from twin.figures.warnings import in_words, warnings
 from twin.model.dataset import DataSet
 from twin.monitor.cycles import LONGEST_PIECE, Cycle
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 from twin.quality import BREAK
 from twin.signals import MBAR, MS, SAMPLE, TICK, Phase, Samples, Ticks, joined
 

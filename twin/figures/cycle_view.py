@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model.compiled import compiled
-from twin.model.control import LEAK_SETTLE_S, PROTECTED_S
+from twin.model.safeguards import LEAK_SETTLE_S, PROTECTED_S
 from twin.quality import UNUSABLE
 from twin.signals import BAR, MBAR, NS, Phase, Samples, Ticks
 

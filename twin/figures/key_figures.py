@@ -8,10 +8,13 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from twin.figures.cycle_view import CycleFindings, Rows, find_in_cycle
 from twin.model.dataset import DataSet
 from twin.signals import BAR, MBAR
+
+if TYPE_CHECKING:  # it loads the compiler, and a configuration needs only the names of figures
+    from twin.figures.cycle_view import CycleFindings, Rows
 
 BANDS = (67.0, 133.0, 200.0)  # mbar/s, of leakage
 WORST_LEAKAGE = 500.0  # mbar/s: quality 0
@@ -40,7 +43,7 @@ class Unit:
         return self.data.ejector.h2_mbar
 
 
-Of = Callable[[CycleFindings, Unit], float]
+Of = Callable[["CycleFindings", Unit], float]
 
 
 @dataclass(frozen=True)
@@ -58,12 +61,12 @@ class Figure:
         return self.name.replace("_", " ").replace("h1", "H1")
 
 
-def t0(findings: CycleFindings, _unit: Unit) -> float:
+def t0(findings: "CycleFindings", _unit: Unit) -> float:
     """Evacuation time to H2 (ms)."""
     return findings.vacuum.h2_s * 1e3
 
 
-def t1(findings: CycleFindings, _unit: Unit) -> float:
+def t1(findings: "CycleFindings", _unit: Unit) -> float:
     """Evacuation time from H2 to H1 (ms), or to the air saving's switching if there is one."""
     if not findings.vacuum.seamless:
         return UNKNOWN
@@ -72,23 +75,23 @@ def t1(findings: CycleFindings, _unit: Unit) -> float:
     return passed * 1e3 if passed > 0.0 else UNKNOWN  # the sensor is too slow to tell
 
 
-def leakage(findings: CycleFindings, _unit: Unit) -> float:
+def leakage(findings: "CycleFindings", _unit: Unit) -> float:
     """Vacuum lost per time (mbar/s): slope of a line through the first stretch of hold."""
     return findings.vacuum.leakage
 
 
-def leakage_band(findings: CycleFindings, unit: Unit) -> float:
+def leakage_band(findings: "CycleFindings", unit: Unit) -> float:
     """Band of the leakage, as the field has them: 0 is good, 3 is beyond the last."""
     lost = leakage(findings, unit)
     return UNKNOWN if math.isnan(lost) else float(bisect_right(BANDS, lost))
 
 
-def quality(findings: CycleFindings, unit: Unit) -> float:
+def quality(findings: "CycleFindings", unit: Unit) -> float:
     """Quality (%) from the leakage: 100 without any."""
     return _percent(1.0 - leakage(findings, unit) / WORST_LEAKAGE)
 
 
-def free_flow(findings: CycleFindings, unit: Unit) -> float:
+def free_flow(findings: "CycleFindings", unit: Unit) -> float:
     """Vacuum (mbar) at which suction settles below H1, as with the cup open."""
     if not findings.is_even or (findings.is_whole and findings.nozzle.went_off):
         return UNKNOWN
@@ -98,17 +101,17 @@ def free_flow(findings: CycleFindings, unit: Unit) -> float:
     return findings.vacuum.last if free else UNKNOWN
 
 
-def performance(findings: CycleFindings, unit: Unit) -> float:
+def performance(findings: "CycleFindings", unit: Unit) -> float:
     """Performance (%) from the free-flow vacuum: 100 without any restriction, 0 at H1."""
     return _percent(1.0 - free_flow(findings, unit) / unit.h1)
 
 
-def max_vacuum(findings: CycleFindings, _unit: Unit) -> float:
+def max_vacuum(findings: "CycleFindings", _unit: Unit) -> float:
     """Highest vacuum (mbar)."""
     return findings.vacuum.highest if findings.is_even else UNKNOWN
 
 
-def h1_not_reached(findings: CycleFindings, unit: Unit) -> float:
+def h1_not_reached(findings: "CycleFindings", unit: Unit) -> float:
     """1 if suction ended before H1 was reached, else 0."""
     if findings.vacuum.seamless and findings.nozzle.went_off:
         return 0.0
@@ -116,12 +119,12 @@ def h1_not_reached(findings: CycleFindings, unit: Unit) -> float:
     return UNKNOWN if math.isnan(highest) else float(highest < unit.h1)
 
 
-def nozzle_share(findings: CycleFindings, _unit: Unit) -> float:
+def nozzle_share(findings: "CycleFindings", _unit: Unit) -> float:
     """Share of the suction time in which the nozzle was on (%)."""
     return 100.0 * _nozzle_s(findings) / findings.suction_s if findings.suction_s else UNKNOWN
 
 
-def air(findings: CycleFindings, unit: Unit) -> float:
+def air(findings: "CycleFindings", unit: Unit) -> float:
     """Compressed air (Nl) through nozzle and blow-off."""
     if not findings.blown:
         return UNKNOWN
@@ -131,42 +134,42 @@ def air(findings: CycleFindings, unit: Unit) -> float:
     return nominal * _pressed(findings, unit) / 60.0
 
 
-def energy(findings: CycleFindings, unit: Unit) -> float:
+def energy(findings: "CycleFindings", unit: Unit) -> float:
     """Electric energy (Wh) to compress that air."""
     return air(findings, unit) * unit.energy_kwh_m3
 
 
-def switchings(findings: CycleFindings, _unit: Unit) -> float:
+def switchings(findings: "CycleFindings", _unit: Unit) -> float:
     """Number of times the nozzle was switched on."""
     return float(findings.nozzle.switchings) if findings.is_whole else UNKNOWN
 
 
-def quick_switchings(findings: CycleFindings, _unit: Unit) -> float:
+def quick_switchings(findings: "CycleFindings", _unit: Unit) -> float:
     """Most switchings of the air saving, on or off, within the time of valve protection."""
     return float(findings.nozzle.quick_switchings) if findings.is_whole else UNKNOWN
 
 
-def supply(findings: CycleFindings, _unit: Unit) -> float:
+def supply(findings: "CycleFindings", _unit: Unit) -> float:
     """Mean operating pressure while the nozzle was on (bar)."""
     return findings.supply.mean
 
 
-def lowest_supply(findings: CycleFindings, _unit: Unit) -> float:
+def lowest_supply(findings: "CycleFindings", _unit: Unit) -> float:
     """Lowest operating pressure while the nozzle was on (bar)."""
     return findings.supply.lowest
 
 
-def highest_supply(findings: CycleFindings, _unit: Unit) -> float:
+def highest_supply(findings: "CycleFindings", _unit: Unit) -> float:
     """Highest operating pressure while the nozzle was on (bar)."""
     return findings.supply.highest
 
 
-def _nozzle_s(findings: CycleFindings) -> float:
+def _nozzle_s(findings: "CycleFindings") -> float:
     """Time that the nozzle was on (s); unknown if a switching may have been missed."""
     return findings.nozzle.on_s if findings.is_whole else UNKNOWN
 
 
-def _pressed(findings: CycleFindings, unit: Unit) -> float:
+def _pressed(findings: "CycleFindings", unit: Unit) -> float:
     """Absolute operating pressure over that of the data set: a sonic nozzle's flow follows it."""
     ambient, nominal = unit.data.ambient.pressure_mbar * MBAR / BAR, unit.data.supply.nozzle_bar
     measured_bar = supply(findings, unit)
@@ -228,8 +231,10 @@ FIGURES = {
 }
 
 
-def figures(rows: Rows, unit: Unit) -> dict[str, float]:
+def figures(rows: "Rows", unit: Unit) -> dict[str, float]:
     """All key figures of one side of a cycle; NaN if unknown."""
+    from twin.figures.cycle_view import find_in_cycle  # noqa: PLC0415 - as above
+
     findings = find_in_cycle(rows, unit.h2, unit.h1)
     return {name: figure.of(findings, unit) for name, figure in FIGURES.items()}
 

@@ -17,9 +17,9 @@ from twin.figures.money import Interval
 from twin.figures.simulated import Program, SimulatedCycle, mean_air, simulated
 from twin.inference.levels import SIGMAS_95
 from twin.model import theta as c
-from twin.model.control import PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import apply, standing_for
+from twin.model.safeguards import PROTECTED_S, PROTECTED_SWITCHES
 from twin.model.theta import Theta
 from twin.monitor.healthy import Healthy
 from twin.monitor.uncertain_data import drawn

@@ -8,11 +8,10 @@ from pydantic import Field, model_validator
 
 from twin.assets.configured import DatabaseSettings
 from twin.config import Config
-from twin.figures.expected import leakage_from_rest, t1_from_rest
 from twin.model.dataset import DataSet
 from twin.monitor.false_alarm_budget import LIMITS, cycles_between, student_limit
 from twin.monitor.healthy import Healthy
-from twin.monitor.monitor import MonitorSettings
+from twin.monitor.settings import MonitorSettings
 
 Positive = Annotated[float, Field(gt=0.0)]
 LOWEST = "lowest_supply"  # the figure whose limit is a lower one
@@ -199,12 +198,14 @@ def _of_data_set(name: str, data: DataSet, tolerance: float) -> float:
     Leakage may be at least what the ejector permits, and a free-flow vacuum is below H2. Those of
     t1 and leakage simulate a suction, which takes time: only where they are needed.
     """
+    from twin.figures import expected  # noqa: PLC0415 - with the compiler
+
     ejector = data.ejector
     if name == "free_flow":
         return ejector.h2_mbar - ejector.h2_hysteresis_mbar
     if name == "t1":
-        return permitted(t1_from_rest(data), tolerance, LEAST[name])
+        return permitted(expected.t1_from_rest(data), tolerance, LEAST[name])
     if name == "leakage":
-        leakage = permitted(leakage_from_rest(data), tolerance, LEAST[name])
+        leakage = permitted(expected.leakage_from_rest(data), tolerance, LEAST[name])
         return max(leakage, ejector.permitted_leakage_mbar_s)
     return _limit_about(name, data.supply.nozzle_bar, tolerance, LEAST[name])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from twin.figures.settings import HIGHEST, LIMITED, LOWEST, Limits
-from twin.model.control import PROTECTED_SWITCHES
+from twin.model.safeguards import PROTECTED_SWITCHES
 
 Measured = Mapping[str, float]
 

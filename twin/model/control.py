@@ -14,11 +14,8 @@ import numpy.typing as npt
 
 from twin.model import theta as c
 from twin.model.compiled import compiled, per_row
+from twin.model.safeguards import LEAK_SETTLE_S, PROTECTED_S, PROTECTED_SWITCHES
 from twin.signals import Command
-
-PROTECTED_SWITCHES = 6  # more switchings than this within PROTECTED_S mean continuous suction
-PROTECTED_S = 3.0  # s
-LEAK_SETTLE_S = 0.05  # s from the nozzle's going off until leakage is judged
 
 Floats = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]

@@ -16,9 +16,9 @@ from pydantic import Field, field_validator, model_validator
 
 from twin.errors import ConfigError
 from twin.model import theta as c
+from twin.model.air import CRITICAL_RATIO, GAMMA, R
 from twin.model.catalogue import CatalogueEffect, refuse_name
 from twin.model.effects import FLATTEST, apply
-from twin.model.gas import CRITICAL_RATIO, GAMMA, R
 from twin.model.parts import Part, Tube, Vessel, lumped
 from twin.model.term import Term
 from twin.model.theta import Theta

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
+from twin.model.air import GAMMA, R
 from twin.model.compiled import compiled, inlined, per_row
 from twin.model.control import (
     air_saving,
@@ -22,7 +23,6 @@ from twin.model.control import (
     part_present,
     switch,
 )
-from twin.model.gas import GAMMA, R
 from twin.model.mechanism import (
     ABOVE,
     ALSO_ON,

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.model.gas import CRITICAL_RATIO, VISCOSITY, R, orifice
+from twin.model.air import CRITICAL_RATIO, VISCOSITY, R, orifice
 from twin.settings import Settings
 from twin.signals import MBAR, ML, SL_MIN
 
@@ -159,7 +159,7 @@ def lumped(
 
 def _share(vacuum: float, ambient: float, critical: float) -> float:
     """Flow through an opening into a ``vacuum`` (Pa) below ``ambient``, over its sonic flow."""
-    share, _ = orifice.py_func(1.0 - vacuum / ambient, critical)
+    share, _ = orifice(1.0 - vacuum / ambient, critical)
     return float(share)
 
 

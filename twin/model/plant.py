@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
+from twin.model.air import CP, CRITICAL_RATIO, GAMMA, R
 from twin.model.compiled import compiled, inlined
-from twin.model.gas import CP, CRITICAL_RATIO, GAMMA, R, opening
+from twin.model.gas import opening
 from twin.model.mechanism import ALSO_ON, ON, SLOTS, WIDTH
 from twin.model.theta import Theta
 

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.model import theta as c
+from twin.model.air import GAMMA, R
 from twin.model.dataset import DataSet, coefficients, swing
-from twin.model.gas import GAMMA, R
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
 from twin.monitor.simulated_switching import bend_in_free_run, detected_switching

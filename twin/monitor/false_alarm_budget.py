@@ -6,8 +6,6 @@ that few cycles showed counts by Student's distribution.
 
 import math
 
-from scipy.special import ndtri, stdtrit
-
 # Shares of all false alarms. Sums use theirs up; the others stay far below, since a single figure
 # is judged as if it had the longest tail. A larger share would gain them little.
 SUMS, SINGLE_CYCLES, LIMITS = 0.9, 0.05, 0.05
@@ -24,10 +22,14 @@ def cycles_between(days: float, share: float, seconds: float) -> float:
 
 def normal_limit(cycles: float, figures: int) -> float:
     """Standard normal value that one of ``figures`` exceeds, two-sided, once in ``cycles``."""
+    from scipy.special import ndtri  # noqa: PLC0415 - else each configuration loads SciPy
+
     return -float(ndtri(0.5 / (cycles * figures)))
 
 
 def student_limit(cycles: float, figures: int, reference_cycles: int) -> float:
     """One-sided limit in sigmas about the mean, both estimated from ``reference_cycles``."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - as above
+
     t = -float(stdtrit(reference_cycles - 1, 1.0 / (cycles * figures)))
     return t * math.sqrt(1.0 + 1.0 / reference_cycles)

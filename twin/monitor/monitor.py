@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from twin.events import Event, Kind
 from twin.model import theta as c
@@ -30,12 +29,12 @@ from twin.monitor.cycles import (
     met_no_part,
 )
 from twin.monitor.gaps import gap_event
-from twin.monitor.healthy import NOT_COMMISSIONED, Healthy
+from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.monitor.likeness import Likeness
+from twin.monitor.settings import MonitorSettings
 from twin.monitor.signal_checks import ReportWatch
 from twin.monitor.surroundings import following
 from twin.quality import BREAK, NEW_TIME, Quality
-from twin.settings import Settings
 from twin.signals import NS, SAMPLE, TICK, LastRow, Samples, Ticks, joined
 
 if TYPE_CHECKING:  # its SciPy would be imported with every configuration
@@ -61,18 +60,6 @@ LARGE = 6.0  # sigmas: a cycle must exceed GREW times this for a second cause to
 SHORTEST_S = 0.1  # shortest duration of a cycle
 GREW = 2.0  # factor over the farthest cycle so far from which something else has begun
 PHASES = {"h1": "suction", "h1_low": "hold"}  # phases that end at a level of the air saving
-
-
-class MonitorSettings(Settings):
-    """When a deviation is an alarm."""
-
-    # Mean time between false alarms of any kind, of a unit.
-    false_alarm_days: float = Field(30.0, gt=0.0)
-    clear_cycles: int = Field(3, ge=1)  # successive normal cycles that clear the alarm
-    smallest_mbar: float = Field(0.5, ge=0.0)  # deviations below are never worth an alarm
-    stale_ms: float = Field(500.0, gt=0.0)  # without a new row, after which the PLC is stale
-    isolate: bool = True  # step a bank of hypotheses beside the twin, and sum over cycles
-    healthy: Healthy = Healthy()
 
 
 class Outlier(NamedTuple):

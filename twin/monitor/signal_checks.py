@@ -15,7 +15,7 @@ from twin.events import Event, Kind
 from twin.inference.priors import FARTHEST, GAUGE
 from twin.model import kernel
 from twin.model import theta as c
-from twin.model.gas import R
+from twin.model.air import R
 from twin.model.theta import Theta
 from twin.monitor.cycles import Cycle
 from twin.monitor.measured_supply import LEAST, MOST, is_gauge, is_possible, with_nozzle_on

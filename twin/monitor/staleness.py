@@ -10,14 +10,16 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from twin.events import Event, Kind
-from twin.monitor.monitor import Monitor
 from twin.quality import Quality, mark
 from twin.signals import NS, LastRow, Samples
+
+if TYPE_CHECKING:  # it loads the compiler, and a PLC is waited for without
+    from twin.monitor.monitor import Monitor
 
 LONGEST_WAIT_NS = 500_000_000  # drivers give a block at least this often: else the host slept
 ONCE_NS = 60_000_000_000  # a twin that is late again within this time does not report it again
@@ -56,7 +58,7 @@ class Listening:
     _late_ns: int | None = field(default=None)  # last time at which the twin was late, by ``clock``
 
     def over(
-        self, source: Iterable[Samples], monitor: Monitor
+        self, source: Iterable[Samples], monitor: "Monitor"
     ) -> Iterator[tuple[Samples, list[Event]]]:
         """The blocks, each with the events of its delay, at the PLC's time before it."""
         blocks = iter(source)
@@ -70,7 +72,9 @@ class Listening:
             yield rows, notices + events
             asked_ns = self.clock()
 
-    def _judge(self, block: Samples, monitor: Monitor, now_ns: int) -> tuple[Samples, list[Event]]:
+    def _judge(
+        self, block: Samples, monitor: "Monitor", now_ns: int
+    ) -> tuple[Samples, list[Event]]:
         fresh = np.flatnonzero((block["quality"] & Quality.STALE) == 0)
         last = self._last.row
         if not len(block) and not len(last) and self._listened_ns > monitor.stale_ns:

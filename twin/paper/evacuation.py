@@ -14,8 +14,8 @@ import numpy.typing as npt
 from twin.assets.shipped import shipped_records
 from twin.model import kernel
 from twin.model import theta as c
+from twin.model.air import R
 from twin.model.dataset import Ambient, DataSet, Ejector, System, coefficients
-from twin.model.gas import R
 from twin.model.parts import Part, Sensor, Tube, Vessel, area, volume
 from twin.signals import MBAR, ML, MS, SL_MIN, Phase
 
