@@ -150,6 +150,21 @@ def test_mechanisms_outside_the_table_are_counted_each() -> None:
     assert "| `nozzle_icing` | 4 | 2 | 1 | 1 |" in tables(cases)
 
 
+def test_what_hides_below_the_noise_counts_apart_too() -> None:
+    """Nobody can find an effect that moves the record by less than its rows scatter."""
+    ice, told = [replace(LEAK, effect="nozzle_icing")], answer("leakage", "consistent")
+    moves = {0.1: False, 2.0: True}
+    cases = [
+        Case("unlisted", 1, "gripper", ice, told, more={"moved_mbar": moved, "noise_mbar": 0.7})
+        for moved in moves
+    ]
+    assert [("shown" in case.outcomes) for case in cases] == [*moves.values()]
+    assert "shown" not in Case("unlisted", 1, "gripper", ice, told).outcomes  # not known
+    page = tables(cases)
+    assert f"| {ASKED['unlisted'].words} | 0 of 2 " in page
+    assert f"| {ASKED['shown'].words} | 0 of 1 " in page
+
+
 def test_each_mechanism_outside_the_table_takes_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     unit = battery_first.Unit("gripper", rig_of(shipped("gripper")), None)  # type: ignore[arg-type]
     monkeypatch.setattr(battery_first, "unit", lambda *_: unit)

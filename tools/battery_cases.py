@@ -215,9 +215,15 @@ def _healthy(case: Case) -> Mapping[str, float | None]:
 
 
 def _unlisted(case: Case) -> Mapping[str, float | None]:
-    """An effect outside the table: unlisted, or explained by what describes it as well."""
+    """An effect outside the table: unlisted, or explained by what describes it as well.
+
+    Counted apart where it moves the record by more (rms) than a row's noise, if that is known.
+    """
     described = case.verdict == "explained" and all(case.right_causes)
-    return {"unlisted": case.verdict == "unlisted" or described}
+    is_right = case.verdict == "unlisted" or described
+    moved, noise = (case.more.get(key) for key in ("moved_mbar", "noise_mbar"))
+    shows = moved is not None and noise is not None and moved > noise
+    return {"unlisted": is_right, "shown": is_right if shows else None}
 
 
 def _commissioning(case: Case) -> Mapping[str, float | None]:

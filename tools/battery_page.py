@@ -43,6 +43,7 @@ ASKED = {
     "pairs": Asked("pairs, both named", 0.90),
     "consistent": Asked("healthy records called consistent", 0.98),
     "unlisted": Asked("effects outside the table called unlisted", 0.92),
+    "shown": Asked("those of them that move the record by more than its noise", 0.92),
 }
 
 
