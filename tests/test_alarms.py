@@ -16,6 +16,7 @@ from twin.alarms.board import Board, Diary, Episode
 from twin.alarms.rules import Priority, Rule, default_rules, read_rules, write_rules
 from twin.alarms.settings import board_rules
 from twin.alarms.state import SECOND_NS, Alarm, AlarmAction, Change, State
+from twin.alarms.statistics import statistics
 from twin.alarms.watch import NAMES, deviating, values
 from twin.errors import ConfigError
 from twin.events import Event, Kind
@@ -536,6 +537,26 @@ def test_what_still_stands_is_announced_with_the_end_of_what_suppressed_it() -> 
     changes = board.see(9 * S, {"fault": 0.0})
     assert [change.action for change in changes if change.announced] == [AlarmAction.UNSUPPRESSED]
     assert board["leak"].state is State.UNACKNOWLEDGED
+
+
+def test_what_suppression_keeps_from_people_does_not_load_them_yet() -> None:
+    board, changes = quiet_figure()
+
+    def load() -> int:
+        named = [("rig", episode) for episode in episodes(changes) if episode.alarm == "leak"]
+        return statistics(named, 0, 10 * S).count
+
+    assert board["leak"].active
+    assert load() == 0
+    changes += board.see(9 * S, {"fault": 0.0})  # now it is announced
+    assert load() == 1
+
+
+def test_of_two_raised_at_once_the_suppressed_one_does_not_load_people() -> None:
+    board = Board([Rule(name="fault", value="fault", above=0.5), leak(suppressed_by=("fault",))])
+    both = episodes(board.see(S, {"fault": 1.0, "leakage": 300.0}))
+    assert [episode.alarm for episode in both] == ["fault", "leak"]
+    assert statistics([("rig", episode) for episode in both], 0, 10 * S).count == 1
 
 
 def test_who_acknowledged_what_was_suppressed_stays_known() -> None:

@@ -482,6 +482,28 @@ def test_in_a_folder_each_run_has_its_log_and_old_ones_make_room(
     assert "log_deleted" in capsys.readouterr().out
 
 
+def test_a_name_without_an_ending_is_a_folder_of_logs(
+    plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert twin(monkeypatch, *run_beside(plc, tmp_path / "line" / "logs"), "--duration", "0.3") == 0
+    (log,) = (tmp_path / "line" / "logs").glob("*.mcap")
+    assert open_log(log).complete
+
+
+def test_a_log_has_the_ending_of_a_log(
+    plc: PlcProcess,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert twin(monkeypatch, *run_beside(plc, tmp_path / "day.txt")) == 2
+    said = capsys.readouterr().err
+    assert "a log is an MCAP file, and its name ends in .mcap" in said
+    assert "--log" in said
+    assert "day.mcap" in said
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("used", "left"), [(79_000, 2), (81_000, 1)])
 def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(

@@ -163,6 +163,15 @@ def test_a_twin_that_is_late_says_so_once_and_nothing_is_stale() -> None:
     assert again.events == [event for event in seen.events if event is not told]
 
 
+def test_while_a_run_loads_its_model_being_late_is_no_news() -> None:
+    samples = received_late(healthy(), [3000], 2 * S)
+    source = Timed(rigs.cut(samples, 100))
+    source.listening.is_starting = lambda: source.ns < 6 * S
+    seen = Slow(source, (30,), 2 * S)
+    run(source, rigs.twin("test_rig"), rigs.monitor("test_rig"), [seen], source.listening)
+    assert seen.of(Kind.TWIN_LATE, *STALENESS) == []
+
+
 def test_a_twin_that_was_late_for_longer_than_the_ring_calls_nothing_stale() -> None:
     samples = lost(healthy(), 3000, 6.0)
     seen = beside(rigs.cut(samples, 100), [30], 6 * S)

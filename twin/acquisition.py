@@ -40,6 +40,10 @@ class Acquisition:
         """When the block came that the loop has (ns); now, once it reads the source itself."""
         return self._now_ns() if self._came_ns is None else self._came_ns
 
+    def is_waiting(self) -> bool:
+        """Whether the block that the loop has waited for the loop."""
+        return self._came_ns is not None
+
     def blocks(self) -> Iterator[Samples]:
         """All blocks in their order; raises what the source raised, after what came before."""
         yield from self.waiting()

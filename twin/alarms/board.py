@@ -9,7 +9,8 @@ from twin.alarms.rules import Priority, Rule
 from twin.alarms.state import SECOND_NS, Alarm, AlarmAction, Change, Kept, State
 from twin.errors import ConfigError
 
-SUPPRESSION = "suppression"  # who acknowledged an alarm that was never announced
+# Who "acknowledged" an alarm that nobody was told of; without a time while it may still be told.
+SUPPRESSION = "suppression"
 _ORDER = tuple(reversed(Priority))  # the most urgent first
 
 
@@ -106,6 +107,11 @@ class Episode:
     raised_as: str = field(default="", compare=False)
 
     @property
+    def is_untold(self) -> bool:
+        """Whether suppression has kept it from people so far, and it may still be announced."""
+        return self.acknowledged_by == SUPPRESSION and self.acknowledged_ns is None
+
+    @property
     def is_over(self) -> bool:
         """Whether the episode is cleared and acknowledged."""
         return self.cleared_ns is not None and self.acknowledged_ns is not None
@@ -143,7 +149,8 @@ class Diary:
         """The new state of each episode that a change begins or alters."""
         before = self._going_on.pop(change.alarm, [])
         if change.action is AlarmAction.RAISED:
-            new = Episode(change.alarm, change.time_ns, raised_as=change.alarm)
+            by = SUPPRESSION if change.untold else ""
+            new = Episode(change.alarm, change.time_ns, acknowledged_by=by, raised_as=change.alarm)
             self._going_on[change.alarm] = [*before, new]
             return [new]
         after = [_after_change(episode, change) for episode in before]
@@ -191,4 +198,8 @@ def _after_change(episode: Episode, change: Change) -> Episode:
         return replace(episode, acknowledged_ns=change.time_ns, acknowledged_by=change.who)
     if change.action is AlarmAction.RENAMED:
         return replace(episode, alarm=change.to)
+    if change.action is AlarmAction.SUPPRESSED and change.untold and episode.cleared_ns is None:
+        return replace(episode, acknowledged_by=SUPPRESSION)  # raised at the same moment
+    if change.action is AlarmAction.UNSUPPRESSED and episode.is_untold:
+        return replace(episode, acknowledged_by="")
     return episode

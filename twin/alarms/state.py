@@ -48,7 +48,8 @@ class Change:
     """One change of one alarm; ``who`` is empty if the program made it.
 
     ``announced`` says that people must be notified now. A renamed alarm goes on as ``to``. An alarm
-    that was cleared ``untold`` needs no acknowledgement.
+    was raised ``untold`` if suppression kept it from people; cleared so, it needs no
+    acknowledgement.
     """
 
     time_ns: int
@@ -180,7 +181,8 @@ class Alarm:
             yield from self._turn(now)
         self.suppressed = suppressed
         self._untold &= suppressed
-        yield self._change(now, AlarmAction.SUPPRESSED if suppressed else AlarmAction.UNSUPPRESSED)
+        action = AlarmAction.SUPPRESSED if suppressed else AlarmAction.UNSUPPRESSED
+        yield replace(self._change(now, action), untold=self._untold)
 
     def serve(self, now: int, in_service: bool, who: str) -> Iterator[Change]:
         """Put it into service, or take it out."""
@@ -222,7 +224,7 @@ class Alarm:
         if self.active:
             self._untold = self.suppressed and self.acknowledged
             self.acknowledged = False
-            yield self._change(now, AlarmAction.RAISED)
+            yield replace(self._change(now, AlarmAction.RAISED), untold=self._untold)
             return
         untold, self._untold = self._untold, False
         self.acknowledged |= untold

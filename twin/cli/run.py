@@ -63,7 +63,7 @@ def run(
     ] = None,
     log: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write an MCAP log; a new one each time in a folder."),
+        typer.Option(metavar="FILE", help="Write an MCAP log; in a folder, a new one each time."),
     ] = None,
     view: ViewFlag = False,
     rrd: RrdFile = None,
@@ -95,8 +95,8 @@ def run(
     alone = len(configs) == 1
     if not alone:
         _refuse_one_id(unit, len(configs))
-    _require_writable_targets(log, rrd)  # the PLC may answer much later
     ejectors = _by_asset([configured(Document.read(path), assets, unit) for path in configs])
+    _require_writable_targets(log, rrd)  # the PLC may answer much later
     width = 0 if alone else max(map(len, ejectors))
     pool = ConnectionPool()
 
@@ -162,6 +162,7 @@ def run(
         if alone:
             run_one(*next(iter(ejectors.items())))
         else:
+            models.load()  # several loops that load at once would hold up their own acquisition
             loops = {name: partial(run_one, name, settings) for name, settings in ejectors.items()}
             failed = run_together(loops, lambda name, cause: complain(f"{name}: {cause}"))
         if failed:
@@ -253,12 +254,30 @@ def _refuse_one_id(unit: str, ejectors: int) -> None:
 
 
 def _require_writable_targets(log: Path | None, rrd: Path | None) -> None:
-    """SourceError if log or view cannot be written."""
+    """SourceError if log or view cannot be written; ConfigError if the log's name is no log's.
+
+    A name without an ending is a folder; it is made if there is none.
+    """
+    from twin.log.part import refuse_other_suffix
+
     require_writable(rrd)
-    if log is None or not log.is_dir():
+    if log is None:
+        return
+    if log.suffix and not log.is_dir():
+        refuse_other_suffix(log, "--log")
         require_writable(log)
-    elif not os.access(log, os.W_OK):
-        raise SourceError(f"{log}: cannot be written to", "see to the rights of the folder")
+    else:
+        _require_folder(log)
+
+
+def _require_folder(path: Path) -> None:
+    """Make a folder if it does not exist; SourceError if it cannot be written to."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}", "name a folder, or a file.mcap") from error
+    if not os.access(path, os.W_OK):
+        raise SourceError(f"{path}: cannot be written to", "see to the rights of the folder")
 
 
 def _file_of(path: Path | None, label: str, name: str) -> Path | None:
@@ -374,7 +393,7 @@ def _acquired(
 
     with closed(source):
         rows = Acquisition(source, ahead=ahead)
-        listening.clock = rows.clock
+        listening.clock, listening.is_starting = rows.clock, rows.is_waiting
         with closed(rows):
             yield rows
 

@@ -87,18 +87,18 @@ def write_report(diagnosis: Diagnosis, path: Path, language: Language = ENGLISH)
 
 def summary(diagnosis: Diagnosis) -> str:
     """The answer as a part of a page: headline, what to do, the gain, and a small picture."""
-    answer, now_ns = diagnosis.json, _received_ns(diagnosis)
+    answer = diagnosis.json
     colour, mark, verdict = BANNER[answer["verdict"]]
-    times, is_sure = Times.of(answer, now_ns), answer["verdict"] == "explained"
+    times, is_sure = Times.of(answer, None), answer["verdict"] == "explained"
     parts = [page.pairs(about(cause, times, sure=is_sure)) for cause in answer["causes"]]
     parts.append(page.pairs(to_do(answer)))
     if weakness := weakness_of(answer):
         parts.append(page.paragraph(f"{capital(weakness)}."))
     if answer["verdict"] == "insufficient":
-        return page.summary(f"{mark} {headline(answer, now_ns)}", parts, colour=colour)
+        return page.summary(f"{mark} {headline(answer, None)}", parts, colour=colour)
     parts.append(_gain_table(answer))
     return page.summary(
-        f"{mark} {tr(verdict)}: {headline(answer, now_ns)}",
+        f"{mark} {tr(verdict)}: {headline(answer, None)}",
         parts,
         draw(diagnosis, "cycle").picture,
         colour,
@@ -106,16 +106,16 @@ def summary(diagnosis: Diagnosis) -> str:
 
 
 def _received_ns(diagnosis: Diagnosis) -> int:
-    """When the log's last row was received: ages count from it, not from when they are read."""
+    """When the log's last row was received (UTC, ns)."""
     received = diagnosis.evidence.samples["host_ns"]
     return int(received[-1]) if len(received) else 0
 
 
 def _page(diagnosis: Diagnosis) -> str:
-    answer, now_ns = diagnosis.json, _received_ns(diagnosis)
+    answer = diagnosis.json
     colour, mark, verdict = BANNER[answer["verdict"]]
     asset = f"{answer['asset']['type']} {answer['asset']['id']}"
-    times = Times.of(answer, now_ns)
+    times = Times.of(answer, None)
     parts = [page.section(tr("What to do"), "\n".join(_steps(answer, times)))]
     if answer["verdict"] == "insufficient":
         parts.append(page.section(tr("The log"), page.pairs(_cycles(answer))))
@@ -130,7 +130,7 @@ def _page(diagnosis: Diagnosis) -> str:
         colour=colour,
         mark=mark,
         verdict=html.escape(f"{tr(verdict)} – {asset}"),
-        headline=html.escape(headline(answer, now_ns)),
+        headline=html.escape(headline(answer, None)),
         body="\n".join(parts),
         footer=_footer(diagnosis, times),
     )
@@ -197,7 +197,7 @@ def draw(diagnosis: Diagnosis, name: str) -> Shown:
             f"an answer whose verdict is {verdict} has no picture {name!r}",
             f"it has {listed(pictures)}" if pictures else str(diagnosis.json["next_experiment"]),
         )
-    times = Times.of(diagnosis.json, _received_ns(diagnosis))
+    times = Times.of(diagnosis.json, None)
     return PICTURES[name](Found.of(diagnosis), times)
 
 
@@ -475,9 +475,9 @@ def _footer(diagnosis: Diagnosis, times: Times) -> str:
         (tr("data set"), f"{diagnosis.data_set}: {_data_set(diagnosis.evidence.theta)}"),
         (tr("program"), f"ejector-twin {version('ejector-twin')}"),
     ]
-    if times.log_begin_ns is not None and times.now_ns is not None:
-        begin, end = dated(times.log_begin_ns), dated(times.now_ns)
-        between = tr("{begin} to {end}; ages count back from its end", begin=begin, end=end)
+    if times.log_begin_ns is not None:
+        begin, end = dated(times.log_begin_ns), dated(_received_ns(diagnosis))
+        between = tr("{begin} to {end}", begin=begin, end=end)
         rows.insert(2, (tr("recorded"), between))
     return page.pairs(rows)
 

@@ -93,7 +93,7 @@ def weakness(weak: Mapping[str, float]) -> str:
     return tr("this twin is usable: off {phases}", phases=listed(phases))
 
 
-def headline(answer: Answer, now_ns: int) -> str:
+def headline(answer: Answer, now_ns: int | None) -> str:
     """One sentence for the technician."""
     causes, times = answer["causes"], Times.of(answer, now_ns)
     match answer["verdict"]:

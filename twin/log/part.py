@@ -19,12 +19,12 @@ def part_path(path: Path, number: int) -> Path:
     return path if number == 0 else path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
-def refuse_other_suffix(path: Path) -> None:
-    """ConfigError for a new log whose name has another suffix than a log's."""
+def refuse_other_suffix(path: Path, option: str = "-o") -> None:
+    """ConfigError for a new log of ``option`` whose name has another suffix than a log's."""
     if path.suffix != SUFFIX:
         raise ConfigError(
             f"{path}: a log is an MCAP file, and its name ends in {SUFFIX}",
-            f"say -o {path.with_suffix(SUFFIX)}",
+            f"say {option} {path.with_suffix(SUFFIX)}",
         )
 
 

@@ -50,6 +50,8 @@ class Listening:
     """Times the blocks of a live source; a replay needs none of it."""
 
     clock: Callable[[], int] = time.perf_counter_ns  # monotonic
+    # While the run loads its model the twin may be late: that is no sign of a busy machine.
+    is_starting: Callable[[], bool] = lambda: False
     notices: Notices = field(default_factory=Notices)
     answer: LastRow = field(default_factory=LastRow)  # before the loop; given if none comes to it
     _last: LastRow = field(default_factory=LastRow)  # that is not stale
@@ -100,7 +102,7 @@ class Listening:
     def _late(self, time_ns: int, now_ns: int, stale_ns: int) -> list[Event]:
         """TWIN_LATE if the twin was late, unless reported a short time ago."""
         late_ns = now_ns - self._heard_ns
-        if late_ns <= stale_ns:
+        if late_ns <= stale_ns or self.is_starting():
             return []
         before, self._late_ns = self._late_ns, now_ns
         if before is not None and now_ns - before < ONCE_NS:

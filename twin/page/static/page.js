@@ -43,11 +43,13 @@ async function post(path, what) {
 
 function summary(state) {
   const standing = state.alarms.filter((one) => !QUIET.includes(one.state)).length;
-  const quiet = state.alarms.length - standing;
+  const shelved = state.alarms.filter((one) => one.state === "shelved").length;
+  const others = state.alarms.length - standing - shelved;
   const parts = [];
   if (!state.running) parts.push(state.last ? t("since {time}", { time: state.last_seen }) : t("never yet"));
   if (standing) parts.push(tn("{count} alarm", "{count} alarms", standing));
-  if (quiet) parts.push(tn("{count} shelved", "{count} shelved", quiet));
+  if (shelved) parts.push(tn("{count} shelved", "{count} shelved", shelved));
+  if (others) parts.push(tn("{count} not announced", "{count} not announced", others));
   return parts.join(", ") || t("no alarm");
 }
 
