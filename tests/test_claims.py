@@ -26,7 +26,7 @@ from twin.hil import LONGEST_GAP_S
 from twin.log import recorder
 from twin.log.columns import encode
 from twin.log.schema import SAMPLES
-from twin.model import gas
+from twin.model import air
 from twin.monitor import change_detection as change
 from twin.monitor import clock, detector_window, prediction_cache
 from twin.monitor.cycles import LONGEST_PIECE
@@ -215,9 +215,9 @@ VOCABULARY = (
 
 
 def test_rig_and_model_share_the_constants_that_are_said_to_be_shared() -> None:
-    assert R_GAS == gas.R
-    assert pytest.approx(gas.CP - gas.R, rel=1e-3) == CV
-    assert gas.CRITICAL_RATIO == rig.CRITICAL == 0.528
+    assert R_GAS == air.R
+    assert pytest.approx(gas.CP - air.R, rel=1e-3) == CV
+    assert air.CRITICAL_RATIO == rig.CRITICAL == 0.528
     text = (rigs.ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     assert "the critical ratio 0.528" in text
 
