@@ -618,6 +618,9 @@ def counted(scale: float, offset: float) -> Callable[[Samples], None]:
         (counted(1.0, 1.0), "absolute pressure, taken for gauge"),
         (counted(-1.0, 1.0), "vacuum, taken for absolute pressure"),
         (counted(0.1, 0.0), "mbar absolute: too little"),
+        (counted(10.0, 0.0), "no vacuum does so"),
+        (counted(14.5, -13.5), "no vacuum does so"),  # a vacuum in psi, read as bar
+        (counted(1000.0, 0.0), "no vacuum does so"),
         (counted(0.001, 0.999), "no vacuum is made"),
     ],
 )

@@ -193,8 +193,8 @@ def sentences(verdict: Verdict) -> list[str]:
         tr("Nothing is stored: causes would be named wrongly"),
         tr(
             "Commands, unit and sign look right, and the fit makes up for rough volumes and tubes."
-            " So something hangs on the ejector that [data.system.parts] does not list, or the unit"
-            " has a fault already, or it does what the model has not"
+            " What is left may be something that the model does not have, a part that"
+            " [data.system.parts] does not list, or a fault of the unit"
         ),
         tr("What needs no twin: twin figures, twin compare"),
     ]

@@ -13,6 +13,9 @@ from twin.signals import MBAR, Command, Samples
 
 NEVER_OPENED = 0.2  # of ambient pressure: a record below it was never at ambient
 TWICE = 1.5  # of ambient pressure: an idle above it counts ambient pressure twice
+# Of ambient pressure. A wrong reference counts it twice or not at all: an idle three times as high,
+# or a vacuum so far below zero, has another unit.
+TOO_HIGH, TOO_DEEP = 3.0, -1.1
 BELOW_NOTHING = -20.0 * MBAR  # Pa, absolute: lower than a slightly wrong ambient explains
 # A pressure that holds and then rises is not a leak: a leak, choked all the way, makes a tenth of
 # its rise within an eighth of the time that nine tenths take.
@@ -26,6 +29,12 @@ TAG = "[driver.tags.pressure], or of the column"
 def refuse_miswired(samples: Samples, readings: Readings, ambient: float) -> None:
     """ConfigError if the curves show another wiring; ``ambient`` (Pa) as configured."""
     _refuse_two_units(samples)
+    if readings.idle > TOO_HIGH * ambient or readings.deepest < TOO_DEEP * ambient:
+        raise ConfigError(
+            f"the pressure goes from {readings.deepest / MBAR:.0f} to {readings.highest / MBAR:.0f}"
+            f" mbar absolute, and ambient pressure is {ambient / MBAR:.0f}: no vacuum does so",
+            f"check the unit of {TAG}: is it read in bar, psi or kPa, and measured in mbar?",
+        )
     if readings.rises_in_suction:
         _refuse_rising(readings, ambient)
     if readings.deepest < BELOW_NOTHING:

@@ -153,6 +153,10 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     "the pressure falls to {deepest} mbar absolute, and none is below zero: it is gauge pressure,"
     " taken for absolute",
     'set reference = "gauge" of [driver.tags.pressure], or of the column',
+    "the pressure goes from {deepest} to {highest} mbar absolute, and ambient pressure is"
+    " {ambient}: no vacuum does so",
+    "check the unit of [driver.tags.pressure], or of the column: is it read in bar, psi or kPa, and"
+    " measured in mbar?",
     "the pressure is never above {highest} mbar absolute: too little, as ambient pressure is"
     " {ambient}",
     "check the unit of [driver.tags.pressure], or of the column: is it in kPa or psi?",
