@@ -5,6 +5,7 @@ const FONT = "15px system-ui, sans-serif";
 const BOTTOM_PX = 26; // room for what stands at the ticks of time
 const SIDE_PX = 28; // half of the widest of them
 const READING_PX = 36; // two lines of the values at the pointer
+const LABEL_PX = { rows: 3, top: 3, high: 18, beside: 4, around: 2 }; // of marks, in rows from the top
 const TICK_PX = { time: 90, value: 44 }; // between two ticks, at least
 const ZOOM = 2; // by one press
 const DATES = LANGUAGE === "en" ? "en-GB" : LANGUAGE; // the day before the month, and 24 hours
@@ -57,6 +58,24 @@ function roomy(low, high) { // a range of values with some room around
   return [low - room, high + room];
 }
 
+/* The boxes of labels of marks at x, in px: each beside its mark, in the first row where it overlaps
+   none before it. What is left out has no room in any row. */
+function placed(labels, width, measure) {
+  const { rows, top, high, beside, around } = LABEL_PX;
+  const taken = Array.from({ length: rows }, () => []);
+  return labels.flatMap((label) => {
+    const wide = measure(label.text) + 2 * around;
+    const isAtEdge = label.x + beside + wide > width;
+    const left = isAtEdge ? Math.max(label.x - beside - wide, 0) : label.x + beside;
+    const box = { left, right: left + wide };
+    const isFree = (one) => box.right <= one.left || one.right <= box.left;
+    const row = box.right > width ? -1 : taken.findIndex((others) => others.every(isFree));
+    if (row < 0) return [];
+    taken[row].push(box);
+    return [{ ...label, ...box, top: top + row * high }];
+  });
+}
+
 // --- the chart -----------------------------------------------------------------------------------
 
 const AXIS = {
@@ -88,8 +107,8 @@ function optionsOf({ colour: name, width = 0, dash = [], dots = false, spanGaps 
    [from, to], as far as it can be seen; least and most: s, the shortest and the longest stretch; values: (low, high) =>
    [low, high] of the axis, which are undefined where there is nothing; ticks: those of time; unit;
    tools: where buttons go; back: the text of one; bands: (from, to) => [{from, to, colour, text}];
-   marks: () => [{at, text, colour, dash, from, to}], from and to of when it may have been; moved:
-   called when another stretch is shown; leave: called in place of going home. */
+   marks: () => [{at, text, colour, dash, from, to}], from and to of when it may have been, those whose
+   labels matter most first; moved: called when another stretch is shown; leave: called in place of going home. */
 class Chart {
   constructor(box, series, options) {
     this.use(options);
@@ -344,35 +363,35 @@ class Chart {
     }
   }
 
-  drawMarks() {
+  drawMarks() { // lines first: none is drawn over a label
     const { plot: { ctx }, area } = this;
-    ctx.textBaseline = "top";
-    const inTime = this.options.marks().sort((one, other) => one.at - other.at);
-    inTime.forEach(({ at, text, colour: name, dash = [], from, to }, i) => {
-      ctx.strokeStyle = ctx.fillStyle = colour(name);
-      if (from !== undefined) this.shade(this.x(from), this.x(to));
-      const x = this.x(at);
-      ctx.lineWidth = 2;
-      ctx.setLineDash(dash);
-      ctx.beginPath();
-      ctx.moveTo(x, 0);
-      ctx.lineTo(x, area.height);
-      ctx.stroke();
-      if (x < 0 || x > area.width) return;
-      const { width } = ctx.measureText(text);
-      this.label(text, x + 6 + width > area.width ? x - 6 - width : x + 6, 4 + 18 * (i % 3), width); // beside those of the same moment
-    });
+    const marks = this.options.marks().map((mark) => ({ ...mark, x: this.x(mark.at) }));
+    marks.forEach((mark) => this.line(mark));
+    const seen = marks.filter(({ x }) => x >= 0 && x <= area.width);
+    placed(seen, area.width, (text) => ctx.measureText(text).width).forEach((label) => this.label(label));
   }
 
-  label(text, left, top, width) { // to be read over whatever is there
+  line({ x, colour: name, dash = [], from, to }) {
+    const { plot: { ctx }, area } = this;
+    ctx.strokeStyle = ctx.fillStyle = colour(name);
+    if (from !== undefined) this.shade(this.x(from), this.x(to));
+    ctx.lineWidth = 2;
+    ctx.setLineDash(dash);
+    ctx.beginPath();
+    ctx.moveTo(x, 0);
+    ctx.lineTo(x, area.height);
+    ctx.stroke();
+  }
+
+  label({ text, colour: name, left, right, top }) { // to be read over whatever is there
     const { ctx } = this.plot;
-    const ink = ctx.fillStyle;
+    ctx.textBaseline = "top";
     ctx.globalAlpha = 0.8;
     ctx.fillStyle = colour("--card");
-    ctx.fillRect(left - 2, top - 1, width + 4, 17);
+    ctx.fillRect(left, top, right - left, LABEL_PX.high - 1);
     ctx.globalAlpha = 1;
-    ctx.fillStyle = ink;
-    ctx.fillText(text, left, top);
+    ctx.fillStyle = colour(name);
+    ctx.fillText(text, left + LABEL_PX.around, top + 1);
   }
 
   shade(left, right) {
