@@ -7,7 +7,7 @@ BIN := .venv/bin
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile --no-loadscope-reorder
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
-.PHONY: help demo test short peers check quick style imports types physics hooks format docs bench battery soak fuzz audit coverage clean
+.PHONY: help demo test short peers check quick style imports types physics hooks format docs pictures bench battery soak fuzz audit coverage clean
 
 help:  ## say what there is (this)
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -53,6 +53,13 @@ format: .venv/dev  ## format the code
 docs: .venv/dev  ## the documentation as pages in site/, its notebooks run anew
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet docs site
 	@echo "open site/index.html"
+
+# Those that need neither a run beside them nor many minutes; CONTRIBUTING.md has the others.
+pictures: .venv/dev  ## pictures of the documentation, as far as one command makes each
+	$(BIN)/python tools/architecture.py
+	$(BIN)/python tools/measured_gripper.py
+	$(BIN)/python tools/trend_picture.py docs/pictures/trend.png
+	$(BIN)/python tools/overview_picture.py docs/pictures/all-ejectors.png
 
 bench: .venv/dev  ## how fast it is, beside a floor in the same run
 	$(BIN)/python tools/bench.py
