@@ -24,6 +24,7 @@ from twin.log.reader import open_log
 from twin.signals import PASCAL, Command, Samples, joined
 from twin.tables import reader
 from twin.tables.excel_file import ExcelFile
+from twin.tables.first_cells import Form, form_of
 from twin.tables.likely import likely_columns
 from twin.tables.preview import FIRST, HEIGHT, WIDTH, Preview
 from twin.tables.reader import open_table
@@ -172,10 +173,10 @@ def test_a_supply_in_another_unit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "columns", "asked", "line"),
     [
-        ("p", {"pressure": "p"}, "in which unit is column 'p'", '"p", unit = "mbar"'),
+        ("p", {"pressure": "p"}, "in which unit column 'p' is", '"p", unit = "..."'),
         ("p [kPa]", {"vacuum_mbar": "p [kPa]"}, "its name says kPa", 'unit = "kPa"'),
-        ("p [mA]", {"pressure": "p [mA]"}, "is in mA: which pressures", "signal = [4, 20]"),
-        ("p (V)", {"vacuum": "p (V)"}, r"is in V: which pressures", "signal = [0, 10]"),
+        ("p [mA]", {"pressure": "p [mA]"}, "is in mA, and nothing says", "signal = [4, 20]"),
+        ("p (V)", {"vacuum": "p (V)"}, "is in V, and nothing says", "signal = [0, 10]"),
     ],
 )
 def test_a_unit_that_is_not_clear_is_asked_for(
@@ -419,7 +420,8 @@ def test_what_a_header_may_mean_is_proposed_and_can_be_pasted(name: str) -> None
     time = {"time_ms"} if name == "trace_s7.csv" else set()  # a count of cycles has no unit
     assert proposed.keys() == {"vacuum", "suction", "blow_off"} | time
     written_by_hand = {source.name for source in TRACES[name].columns.values()}
-    assert set(proposed.values()) <= written_by_hand
+    names = {one["name"] if isinstance(one, dict) else one for one in proposed.values()}
+    assert names <= written_by_hand
 
 
 def test_a_line_that_is_proposed_is_toml_whatever_the_name(tmp_path: Path) -> None:
@@ -456,6 +458,112 @@ def test_a_date_and_a_time_of_day_are_proposed_as_such() -> None:
     assert likely_columns(["Date", "Time"]) == {Column.DATE: "Date", Column.TIME: "Time"}
     assert likely_columns(["Datum", "x"]) == {Column.TIME: "Datum"}
     assert likely_columns(["Zeitstempel"]) == {Column.TIME: "Zeitstempel"}
+
+
+def test_a_date_and_time_is_known_by_its_form() -> None:
+    cells = {
+        "Zeit": ["01.03.2026 12:00:00,000", "01.03.2026 12:00:00,010"],
+        "Tag": ["1.3.2026", ""],
+        "Stunde": ["12:00:00.5"],
+        "Zeiten": ["10", "20"],
+        "leer": ["", ""],
+        "Text": ["a: b"],
+        "Datum": ["2026-03-01 00:00:00"],
+        "wann": ["3/13/2026 12:00"],
+        "Zeit und mehr": ["01.03.2026 12:00", "x"],
+    }
+    forms = {name: form_of(column, None) for name, column in cells.items()}
+    assert forms == {
+        "Zeit": Form.INSTANT,
+        "Tag": Form.DATE,
+        "Stunde": Form.TIME_OF_DAY,
+        "Zeiten": None,
+        "leer": None,
+        "Text": None,
+        "Datum": Form.DATE,
+        "wann": Form.INSTANT,
+        "Zeit und mehr": None,
+    }
+    assert likely_columns(["wann", "Zeit"], (), forms) == {Column.TIME: "Zeit"}
+    assert likely_columns(["wann", "Zeiten"], (), forms) == {Column.TIME: "wann"}
+    of_two = {Column.DATE: "Tag", Column.TIME: "Stunde"}
+    assert likely_columns(["Stunde", "Tag"], (), forms) == of_two
+
+
+GERMAN = "Zeit;Druck;Saugen;Abblasen\n" + "".join(
+    f"01.03.2026 12:00:00,{10 * n:03};101,{n};0;0\n" for n in range(10)
+)
+
+
+def test_all_that_a_german_export_lacks_is_named_at_once(tmp_path: Path) -> None:
+    path = written(tmp_path, GERMAN)
+    with pytest.raises(SourceError, match="no column time_s") as caught:
+        open_table(path, settings(), AMBIENT)
+    message, lines = str(caught.value), caught.value.hint.partition(":\n")[2]
+    shown = f"twin: trace.csv:1:{message.rpartition(f'{path}:1:')[2]}\n  {caught.value.hint}\n"
+    assert shown in (DATA.parents[1] / "docs" / "csv.md").read_text(encoding="utf-8")
+    assert "and none for pressure, suction and blow_off" in message
+    assert "in which unit column 'Druck' is; the times say no time zone" in message
+    assert tomllib.loads(lines)["import"] == {
+        "time_zone": "...",
+        "columns": {
+            "time": "Zeit",
+            "suction": "Saugen",
+            "blow_off": "Abblasen",
+            "pressure": {"name": "Druck", "unit": "...", "reference": "absolute"},
+        },
+    }
+    with pytest.raises(ValueError, match=r"columns.pressure.unit") as unchanged:
+        ImportSettings.model_validate(tomllib.loads(lines)["import"])
+    assert "time_zone" in str(unchanged.value)
+    answered = lines.replace('unit = "..."', 'unit = "kPa"').replace('"..."', '"Europe/Berlin"')
+    rows = taken(path, ImportSettings.model_validate(tomllib.loads(answered)["import"]))
+    assert rows["time_ns"][1] == BEGIN_NS + 10_000_000
+    assert rows["pressure"][1] == pytest.approx(101_100.0)
+
+
+def test_a_missing_zone_is_named_with_a_missing_unit(tmp_path: Path) -> None:
+    columns = {"time": "Zeit", "suction": "Saugen", "blow_off": "Abblasen"}
+    pressure = {"name": "Druck", "reference": "gauge", "signal": [4, 20], "range": [0, -1]}
+    with pytest.raises(SourceError, match="in which unit column 'Druck' is; the times") as caught:
+        open_table(written(tmp_path, GERMAN), settings({**columns, "pressure": pressure}), AMBIENT)
+    lines = tomllib.loads(caught.value.hint.partition(":\n")[2])["import"]
+    assert lines == {"time_zone": "...", "columns": {"pressure": {**pressure, "unit": "..."}}}
+    how = settings({**columns, "pressure": "Druck"}, time_zone="UTC")
+    with pytest.raises(SourceError, match=r"in which unit column 'Druck' is$") as of_unit:
+        open_table(written(tmp_path, GERMAN), how, AMBIENT)
+    assert "[import]\n" not in of_unit.value.hint
+
+
+@pytest.mark.parametrize(
+    ("date", "line"),
+    [
+        ("03/04/2026", 'date_order = "..."'),
+        ("03/13/2026", 'date_order = "month"'),
+        ("3.4.2026", ""),
+    ],
+)
+def test_the_order_of_day_and_month_is_asked_for_with_the_rest(
+    tmp_path: Path, date: str, line: str
+) -> None:
+    path = written(tmp_path, f"Tag;Zeit;Druck [bar]\n{date};12:00:00,000;1\n")
+    with pytest.raises(SourceError, match="the times say no time zone") as caught:
+        open_table(path, settings(no_blow_off=True), AMBIENT, derive=True)
+    assert ("whether" in str(caught.value)) == bool(line)
+    lines = tomllib.loads(caught.value.hint.partition(":\n")[2])["import"]
+    assert line in caught.value.hint
+    assert lines["columns"] == {"date": "Tag", "time": "Zeit", "pressure": "Druck [bar]"}
+
+
+def test_first_cells_of_parquet_and_excel_are_looked_at(tmp_path: Path) -> None:
+    noon = BEGIN.replace(tzinfo=None)
+    columns = {"Saugen": [0], "Abblasen": [0], "Druck": [1.0], "t": pa.array([noon])}
+    parquet.write_table(pa.table(columns), tmp_path / "t.parquet")
+    workbook(tmp_path / "t.xlsx", [*columns], [0, 0, 1.0, noon], [1, 0])
+    for name in ("t.parquet", "t.xlsx"):
+        with pytest.raises(SourceError, match="the times say no time zone") as caught:
+            open_table(tmp_path / name, settings(), AMBIENT)
+        assert 'time = "t"' in caught.value.hint
 
 
 def test_how_to_read_a_transmitter_is_shown_by_example(tmp_path: Path) -> None:
@@ -538,6 +646,15 @@ def test_a_sheet_is_read(tmp_path: Path) -> None:
     assert "sheet 'Sheet' is read" in " ".join(open_table(path, how, AMBIENT).notes)
     with pytest.raises(SourceError, match=r"t\.xlsx: row 7: column 'blow_off': the cell is empty"):
         taken(path, settings(columns, time_zone="Europe/Berlin"))
+
+
+def test_a_header_below_a_title_is_found_without_a_known_name(tmp_path: Path) -> None:
+    header = ["Zeit", "Vakuum [kPa]", "Saugen", "Abblasen"]
+    row = [BEGIN.replace(tzinfo=None), 0, False, 0]
+    path = workbook(tmp_path / "t.xlsx", ["Rig 4, left"], header, row)
+    with pytest.raises(SourceError, match=r"row 2: no column .* the columns are 'Zeit'") as caught:
+        open_table(path, settings(), AMBIENT)
+    assert 'vacuum = "Vakuum [kPa]"' in caught.value.hint
 
 
 def test_a_sheet_by_its_name(tmp_path: Path) -> None:

@@ -230,7 +230,9 @@ def test_a_german_excel_trace_becomes_a_log(tmp_path: Path) -> None:
         sheet.append([begin + timedelta(milliseconds=10 * number), round(vacuum, 3), *commands])
     book.save(tmp_path / "Messung.xlsx")
     asked = typed(tmp_path, "import", "Messung.xlsx", "--config", config, "--dry-run", code=3)
-    assert "say under [import.columns] which one it is" in asked
+    assert "by their names and cells these may be" in asked
+    answered = asked.partition("[import]\n")[2].replace('time_zone = "..."', COLUMNS.split("\n")[2])
+    assert all(line in answered for line in COLUMNS.split("\n")[2:])
     config.write_text(config.read_text() + COLUMNS)
     shown = typed(tmp_path, "import", "Messung.xlsx", "--config", config, "--dry-run")
     assert "600 rows, 5.990 s, every 10 ms" in shown

@@ -17,7 +17,7 @@ import pyarrow as pa
 from pyarrow import csv as arrow_csv
 
 from twin.errors import SourceError
-from twin.tables import scope
+from twin.tables import first_cells, scope
 from twin.tables.layout import wanted_names
 from twin.tables.settings import Column, Encoding, ImportSettings
 from twin.tables.table_to_samples import Batch
@@ -64,6 +64,13 @@ class CsvFile:
     def location(self) -> str:
         """File and line of the header."""
         return f"{self._path}:{self._head}"
+
+    def first_rows(self) -> list[list[str]]:
+        """Some rows after the header as text, for what is not known of the columns."""
+        rows = (row for line, row in self._rows() if line >= self._first and self._is_row(row))
+        return [
+            _cells(self._whole(row), self._separator) for row in islice(rows, first_cells.MOST_ROWS)
+        ]
 
     def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns that ``file_names`` lists."""

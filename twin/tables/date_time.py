@@ -20,6 +20,7 @@ _SINCE_1601 = 11_644_473_600 * 10_000_000  # of 100 ns, to 1970
 _MIDNIGHT = r"[T ]+0?0:00(:00([.,]0+)?)?$"  # which spreadsheets and databases add to a date
 _DAY_OF_NONE = "1970-01-01 "
 _OFFSET = r"[0-9]:[0-9]{2}.*(Z|[+-][0-9]{2}(:?[0-9]{2})?)$"
+NO_ZONE = "the times say no time zone, and nothing else does"
 _ISO = re.compile(
     r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.]\d{1,9})?)?(Z|[+-]\d\d(:?\d\d)?)?", re.ASCII
 )
@@ -107,7 +108,7 @@ class Calendar:
         """Local times of the zone in UTC; null where its clock skips or repeats them."""
         if self.zone is None:
             raise SourceError(
-                f"{self.location}: the times say no time zone, and nothing else does",
+                f"{self.location}: {NO_ZONE}",
                 'say it under [import]: time_zone = "Europe/Berlin", or --time-zone (UTC is one)',
             )
         first, last = (

@@ -15,6 +15,7 @@ from openpyxl import load_workbook
 
 from twin.errors import SourceError, known_names
 from twin.files import unzipped_within_budget
+from twin.tables import first_cells
 from twin.tables.layout import wanted_names
 from twin.tables.settings import Column, ImportSettings
 from twin.tables.table_to_samples import Batch
@@ -35,16 +36,25 @@ class ExcelFile:
         known_names = wanted_names(settings)
         with self._rows(self.notes) as rows:
             first = [(number, cells) for number, cells in islice(rows, _PREAMBLE) if any(cells)]
+        self._first = first
         if not first:
             raise SourceError(f"{path}: there is no header row", "name the columns in a first row")
         fits = (row for row in first if known_names & {_text(cell) for cell in row[1]})
-        self._head, header = next(fits, max(first, key=lambda row: len(row[1])))
+        self._head, header = next(fits, max(first, key=lambda row: _words(row[1])))
         self.names = [_text(cell) for cell in header]
 
     @property
     def location(self) -> str:
         """File and row of the header."""
         return f"{self._path}: row {self._head}"
+
+    def first_rows(self) -> list[list[str]]:
+        """Some rows after the header as text, for what is not known of the columns."""
+        below = (cells for number, cells in self._first if number > self._head)
+        return [
+            [_text(cell) for cell in [*cells, *[None] * len(self.names)][: len(self.names)]]
+            for cells in islice(below, first_cells.MOST_ROWS)
+        ]
 
     def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns that ``file_names`` lists."""
@@ -110,6 +120,10 @@ class ExcelFile:
 
 def _has_value(cells: Cells) -> bool:
     return any(cell is not None and cell != "" for cell in cells)
+
+
+def _words(cells: Cells) -> int:
+    return sum(any(map(str.isalpha, _text(cell))) for cell in cells)
 
 
 def _text(cell: Any) -> str:

@@ -10,9 +10,9 @@ from twin.errors import SourceError
 from twin.quality import BREAK, Quality, mark
 from twin.signals import LastRow, Samples
 from twin.tables.date_time import Calendar
-from twin.tables.layout import COMMANDS, DIGITS, REPORTED, Layout
+from twin.tables.layout import COMMANDS, REPORTED, Layout
 from twin.tables.numbers import Mask
-from twin.tables.settings import Bad, Column, ImportSettings
+from twin.tables.settings import DIGITS, Bad, Column, ImportSettings
 from twin.tables.table_to_samples import Batch, Spoilt, decode
 
 _USUAL = 1_000_000  # ns, the period while none is known

@@ -1,18 +1,15 @@
 """Match the columns of a file to the known columns."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 from twin.errors import ConfigError, SourceError
 from twin.signals import MBAR, SL_MIN, ZERO_C, Command, Reported
-from twin.tables.likely import as_toml, likely_columns
-from twin.tables.settings import Column, ColumnSource, ImportSettings, toml_string
-from twin.tables.units import PRESSURES, SUPPLIES, Meaning, find_meaning
+from twin.tables.first_cells import FirstCells
+from twin.tables.lack import Lack, misnamed
+from twin.tables.settings import TIMES, Column, ColumnSource, ImportSettings, Unsaid
+from twin.tables.units import PRESSURES, SUPPLIES, Meaning, UnsaidError, find_meaning
 
-DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
-TIMES = (*DIGITS, Column.TIME)
 REPORTED = {  # the state's bit, and the bit that it is known; an empty cell leaves it unknown
     Column.REPORTED_NOZZLE: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
     Column.REPORTED_AIR_SAVING: (Reported.NOZZLE, Reported.NOZZLE_KNOWN),
@@ -30,7 +27,6 @@ ONE_OF_THEM = (
     (Column.REPORTED_NOZZLE, Column.REPORTED_AIR_SAVING),
     tuple(SUPPLIES),
 )
-_SIGNAL = re.compile(r"[\[(]\s*(mA|V)\s*[\])]\s*$")
 _REQUIRED = (TIMES, tuple(PRESSURES))
 _MEASURED = (*PRESSURES, *SUPPLIES, *BESIDE)  # whose numbers may be scaled
 
@@ -57,11 +53,17 @@ class Layout:
 
 
 def find_layout(
-    header: Sequence[str], settings: ImportSettings, location: str, *, derive: bool = False
+    header: Sequence[str],
+    settings: ImportSettings,
+    location: str,
+    first_cells: Callable[[], FirstCells],
+    *,
+    derive: bool = False,
 ) -> Layout:
     """Find the known columns in a file's header; SourceError names ``location`` and the problem.
 
-    With ``derive`` commands may be lacking, and at least one must be.
+    With ``derive`` commands may be lacking, and at least one must be. What columns, units and times
+    lack is one error, which proposes lines by the ``first_cells``.
     """
     sources = {name: settings.columns.get(name, ColumnSource(name=name)) for name in Column}
     claimed = {source.name for source in settings.columns.values()}  # not under its own name too
@@ -72,8 +74,7 @@ def find_layout(
     }
     for name in settings.columns:
         if name not in file_names:
-            text = f"no column {sources[name].name!r}, which [import.columns] gives for {name}"
-            raise _missing(text, name, header, location, sources[name].name)
+            raise misnamed(name, sources[name].name, header, location)
     commands = tuple(
         name for name in COMMANDS if not (settings.no_blow_off and name is Column.BLOW_OFF)
     )
@@ -83,8 +84,9 @@ def find_layout(
             " and no_blow_off says there is none"
         )
         raise ConfigError(f"{location}: {text}", "take no_blow_off out of [import]")
-    for names in (*_REQUIRED, *([] if derive else [(name,) for name in commands])):
-        _require_one(names, file_names, header, location)
+    required = (*_REQUIRED, *([] if derive else [(name,) for name in commands]))
+    _refuse_several(required, file_names, location)
+    absent = [names for names in required if not file_names.keys() & {*names}]
     lacking = tuple(name for name in commands if name not in file_names)
     if derive and not lacking:
         raise ConfigError(
@@ -101,11 +103,10 @@ def find_layout(
                 f"column {header_name!r} stands there {header.count(header_name)} times", location
             )
     _refuse_scaled(sources, file_names, location)
-    meanings = {
-        name: find_meaning(name, sources[name], settings, location)
-        for name in (*PRESSURES, *SUPPLIES)
-        if name in file_names
-    }
+    meanings, unsaid = _find_meanings(sources, file_names, settings, location)
+    if absent or unsaid:
+        lack = Lack(header, file_names, absent, lacking, unsaid)
+        raise lack.refusal(settings, location, first_cells())
     lines = {name: sources[name].line for name in BESIDE if name in file_names}
     ignored = set(header) - set(file_names.values()) - {""}
     in_order = tuple(name for name in dict.fromkeys(header) if name in ignored)
@@ -136,54 +137,32 @@ def _refuse_scaled(
             )
 
 
-def _require_one(
-    names: Sequence[Column], file_names: Mapping[Column, str], header: Sequence[str], location: str
+def _refuse_several(
+    required: Sequence[Sequence[Column]], file_names: Mapping[Column, str], location: str
 ) -> None:
-    present = [file_names[name] for name in names if name in file_names]
-    if not present:
-        error = _missing(f"no column {' or '.join(names)}", names[0], header, location)
-        likely = likely_columns(header, file_names.values())
-        lines = f"\n{as_toml(likely)}" if likely else ""
-        if not {*likely, *file_names}.intersection(PRESSURES):
-            lines += _signal_line(header)
-        if lines:
-            error.hint += f"; by their names these may be:\n  [import.columns]{lines}"
-        raise error
-    if len(present) > 1:
-        raise _too_many(
-            f"only one of the columns {', '.join(map(repr, present))} can be used", location
-        )
+    for names in required:
+        present = [file_names[name] for name in names if name in file_names]
+        if len(present) > 1:
+            raise _too_many(
+                f"only one of the columns {', '.join(map(repr, present))} can be used", location
+            )
 
 
-def _missing(
-    problem: str, name: Column, header: Sequence[str], location: str, requested: str = ""
-) -> SourceError:
-    names = ", ".join(map(repr, header))
-    listing = names if len(names) <= 300 else f"{names[:300]} ..."
-    hint = f'say under [import.columns] which one it is: {name} = "NAME IN THE FILE"'
-    nearest = get_close_matches(requested, header, n=1) if requested else []
-    if nearest:
-        hint = f"did you mean {nearest[0]!r}? {hint}"
-    if name in TIMES:
-        hint += ", or time_ms, time_us, time_ns by its unit; time, if it is a date or a time of day"
-    if name is Column.BLOW_OFF:
-        hint += "; if the ejector has none, say no_blow_off = true under [import]"
-    if name in COMMANDS:
-        hint += "; if nobody recorded it, twin import --derive-commands finds it from the pressure"
-    return SourceError(f"{location}: {problem}; the columns are {listing}", hint)
-
-
-def _signal_line(header: Sequence[str]) -> str:
-    """A line of ``[import.columns]`` for a transmitter's signal; empty if no name has its unit."""
-    signal = next(filter(None, map(_SIGNAL.search, header)), None)
-    if signal is None:
-        return ""
-    numbers = "[0, 10]" if signal[1] == "V" else "[4, 20]"
-    return (
-        f"\n  pressure = {{ name = {toml_string(signal.string)}, signal = {numbers},"
-        ' range = [0, -1000], unit = "mbar", reference = "gauge" }'
-        "   # put in the pressures that these two numbers mean"
-    )
+def _find_meanings(
+    sources: Mapping[Column, ColumnSource],
+    file_names: Mapping[Column, str],
+    settings: ImportSettings,
+    location: str,
+) -> tuple[Mapping[Column, Meaning], list[Unsaid]]:
+    """Meanings of pressure and supply, and what nothing says of them."""
+    meanings, unsaid = {}, []
+    for name in (*PRESSURES, *SUPPLIES):
+        if name in file_names:
+            try:
+                meanings[name] = find_meaning(name, sources[name], settings, location)
+            except UnsaidError as error:
+                unsaid.append(error.unsaid)
+    return meanings, unsaid
 
 
 def _too_many(problem: str, location: str) -> SourceError:

@@ -1,9 +1,13 @@
-"""Columns that a file's header may mean, by words of the field in English and German."""
+"""Columns that a file's header may mean, by words of the field and the form of their cells.
+
+Words are English and German.
+"""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
 
-from twin.tables.settings import Column, toml_string
+from twin.tables.first_cells import Form
+from twin.tables.settings import Column
 
 _TIME_UNITS = {
     "s": Column.TIME_S,
@@ -23,17 +27,21 @@ _WORDS = {  # in order: a word of suction may stand in the name of a vacuum's bl
     Column.SUCTION: re.compile(r"suction|suck|saug", re.IGNORECASE),
     Column.PRESSURE: re.compile(r"press|druck", re.IGNORECASE),
 }
+_NONE: Mapping[str, Form | None] = {}
 
 
-def likely_columns(header: Sequence[str], taken: Collection[str] = ()) -> Mapping[Column, str]:
+def likely_columns(
+    header: Sequence[str], taken: Collection[str] = (), forms: Mapping[str, Form | None] = _NONE
+) -> Mapping[Column, str]:
     """For each known column the first name of the header that may mean it; ``taken`` are none.
 
-    Only one of vacuum and pressure is given, and no time whose unit the name does not have.
+    Only one of vacuum and pressure is given, and no time whose unit the name does not have, unless
+    the ``forms`` of the cells show that it is a date and time.
     """
-    free = [name for name in header if name not in taken]
-    likely: dict[Column, str] = dict(_date_and_time(free))
+    free = [name for name in header if name and name not in taken]
+    likely: dict[Column, str] = dict(_by_form(free, forms) or _date_and_time(free))
     for name in free:
-        column = _likely(name)
+        column = None if name in likely.values() else _likely(name)
         if column is not None:
             likely.setdefault(column, name)
     if Column.VACUUM in likely:
@@ -45,6 +53,18 @@ def likely_columns(header: Sequence[str], taken: Collection[str] = ()) -> Mappin
     if Column.TIME not in likely:
         likely.pop(Column.DATE, None)
     return likely
+
+
+def _by_form(names: Sequence[str], forms: Mapping[str, Form | None]) -> Mapping[Column, str]:
+    """The column of date and time, or of the time of day, with that of the date beside it."""
+    in_order = sorted(names, key=lambda name: not (_TIME.search(name) or _INSTANT.search(name)))
+    first = {form: name for name in reversed(in_order) if (form := forms.get(name)) is not None}
+    if Form.INSTANT in first:
+        return {Column.TIME: first[Form.INSTANT]}
+    if Form.TIME_OF_DAY not in first:
+        return {}
+    date = {Column.DATE: first[Form.DATE]} if Form.DATE in first else {}
+    return {**date, Column.TIME: first[Form.TIME_OF_DAY]}
 
 
 def _date_and_time(names: Sequence[str]) -> Mapping[Column, str]:
@@ -63,8 +83,3 @@ def _likely(name: str) -> Column | None:
     if _INSTANT.search(name):
         return Column.TIME
     return next((column for column, words in _WORDS.items() if words.search(name)), None)
-
-
-def as_toml(columns: Mapping[Column, str]) -> str:
-    """Lines of ``[import.columns]``; the names stand as TOML wants them."""
-    return "\n".join(f"  {column} = {toml_string(name)}" for column, name in columns.items())

@@ -9,6 +9,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from twin.errors import SourceError
+from twin.tables.first_cells import MOST_COLUMNS, MOST_ROWS
 from twin.tables.numbers import is_readable
 from twin.tables.parquet_pages import require_small_pages
 from twin.tables.settings import Column, ImportSettings
@@ -32,6 +33,24 @@ class ParquetFile:
     def location(self) -> str:
         """The file, for messages on its columns."""
         return str(self._path)
+
+    def first_rows(self) -> list[list[str]]:
+        """Some rows after the header as text, for what is not known of the columns."""
+        with self._opened() as file:  # column by column: one page is in memory
+            columns = [
+                self._first_cells(file, at) for at in range(min(MOST_COLUMNS, len(self.names)))
+            ]
+        columns += [[""] * MOST_ROWS] * (len(self.names) - len(columns))
+        return [list(row) for row in zip(*columns, strict=False)]
+
+    def _first_cells(self, file: parquet.ParquetFile, at: int) -> list[str]:
+        kind = self._schema.field(at).type
+        is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        if not (is_text or pa.types.is_timestamp(kind)):
+            return [""] * MOST_ROWS
+        batch = next(file.iter_batches(MOST_ROWS, columns=[self.names[at]]), None)
+        cells = [] if batch is None else batch.column(0).cast(pa.string()).to_pylist()
+        return ["" if cell is None else cell.strip() for cell in cells]
 
     def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns that ``file_names`` lists."""

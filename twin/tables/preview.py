@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.signals import MBAR, MS, NS, Command, Samples
-from twin.tables.layout import TIMES
 from twin.tables.reader import Table
-from twin.tables.settings import Column
+from twin.tables.settings import TIMES, Column
 
 FIRST = 8  # rows that are shown
 WIDTH, HEIGHT = 72, 10  # of the plot, in characters

@@ -15,6 +15,7 @@ from twin.tables.csv_file import CsvFile
 from twin.tables.date_time import Calendar
 from twin.tables.derive import Derived, derive
 from twin.tables.excel_file import ExcelFile
+from twin.tables.first_cells import FirstCells
 from twin.tables.intake import Intake
 from twin.tables.layout import COMMANDS, Layout, find_layout
 from twin.tables.parquet_file import ParquetFile
@@ -35,6 +36,9 @@ class _File(Protocol):
     @property
     def location(self) -> str:
         """File and line of the columns' names, for messages."""
+
+    def first_rows(self) -> list[list[str]]:
+        """Some rows after the header as text, for what is not known of the columns."""
 
     def batches(self, file_names: Mapping[Column, str]) -> Iterator[Batch]:
         """Give the rows in order, with the columns that ``file_names`` lists."""
@@ -168,8 +172,20 @@ def open_table(
         raise ConfigError(f"{path}: cannot tell what it is", hint)
     file = kind(path, settings)
     try:
-        layout = find_layout(file.names, settings, file.location, derive=derive)
+        layout = find_layout(
+            file.names, settings, file.location, lambda: _first_cells(file), derive=derive
+        )
     except SourceError as error:  # another sheet or encoding may have the column
         error.hint = "\n  ".join((*file.notes, error.hint))
         raise
     return Table(path, layout, settings, ambient, file)
+
+
+def _first_cells(file: _File) -> FirstCells:
+    """The first cells of each column, by its name; none where they cannot be read."""
+    try:
+        rows = file.first_rows()
+    except SourceError:
+        return {}
+    whole = [row for row in rows if len(row) >= len(file.names)]
+    return {name: [row[at] for row in whole] for at, name in enumerate(file.names)}

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -17,6 +17,13 @@ def toml_string(text: str) -> str:
     if '"' in text and "'" not in text:
         return f"'{text}'"
     return json.dumps(text, ensure_ascii=False)
+
+
+class Unsaid(NamedTuple):
+    """Something that neither file nor settings say, with the line of a configuration that would."""
+
+    text: str
+    line: str
 
 
 class Column(StrEnum):
@@ -50,6 +57,10 @@ class Column(StrEnum):
     FLOW_SL_MIN = "flow_sl_min"
     QUALITY = "quality"
     HOST_NS = "host_ns"
+
+
+DIGITS = {Column.TIME_S: 9, Column.TIME_MS: 6, Column.TIME_US: 3, Column.TIME_NS: 0}  # down to ns
+TIMES = (*DIGITS, Column.TIME)
 
 
 class Bad(StrEnum):

@@ -10,9 +10,9 @@ import pyarrow as pa
 from twin.quality import UNUSABLE, Quality
 from twin.signals import SAMPLE, Command, Reported, Samples
 from twin.tables.date_time import Calendar
-from twin.tables.layout import BESIDE, COMMANDS, DIGITS, REPORTED, Layout
+from twin.tables.layout import BESIDE, COMMANDS, REPORTED, Layout
 from twin.tables.numbers import Mask, flags, floats, integers
-from twin.tables.settings import Column
+from twin.tables.settings import DIGITS, Column
 from twin.tables.units import SUPPLIES
 
 _ALL_FLAGS = sum(Quality)

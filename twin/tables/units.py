@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from twin.errors import ConfigError, SourceError
 from twin.signals import PASCAL, Reference, Unit, counted_from
-from twin.tables.settings import Column, ColumnSource, ImportSettings
+from twin.tables.settings import Column, ColumnSource, ImportSettings, Unsaid, toml_string
 
 Floats = npt.NDArray[np.float64]
 
@@ -32,6 +32,14 @@ SUPPLIES: Mapping[Column, tuple[Unit | None, Reference]] = {
 _UNITS = {unit.lower(): unit for unit in get_args(Unit)}
 _ELECTRICAL = {"v": ("V", "[0, 10]"), "ma": ("mA", "[4, 20]")}
 _BRACKET = re.compile(r"[\[(]\s*([^\])]+?)\s*(?:abs\.?|rel\.?)?\s*[\])]\s*$")
+
+
+class UnsaidError(SourceError):
+    """Nothing says what the numbers of a column mean; the line is of ``[import.columns]``."""
+
+    def __init__(self, location: str, unsaid: Unsaid) -> None:
+        super().__init__(f"{location}: {unsaid.text}", f"under [import.columns]: {unsaid.line}")
+        self.unsaid = unsaid
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ def find_meaning(
 ) -> Meaning:
     """The meaning of a column of pressure or supply, from its name, the settings and the header.
 
-    SourceError if none of them gives the unit, or two contradict each other.
+    UnsaidError if none of them gives the unit, SourceError if two contradict each other.
     """
     named, reference = {**PRESSURES, **SUPPLIES}[column]
     if source.reference is not None:
@@ -96,11 +104,8 @@ def find_meaning(
     if unit is None and header in _UNITS:
         return Meaning(_UNITS[header], reference, *source.line, from_header=True)
     if unit is None:
-        raise SourceError(
-            f"{location}: in which unit is column {source.name!r}?",
-            f"say it under [import.columns]: {_generic(column)} ="
-            f' {{ name = {source.quoted}, unit = "mbar" }}; units are {", ".join(get_args(Unit))}',
-        )
+        text = f"nothing says in which unit column {source.name!r} is"
+        raise UnsaidError(location, Unsaid(text, _line(column, source, reference)))
     if (
         source.is_name_only
         and not stated
@@ -140,11 +145,31 @@ def _other_unit(column: Column, source: ColumnSource, stated: Unit, location: st
     )
 
 
-def _electrical(source: ColumnSource, location: str) -> SourceError:
+def _line(column: Column, source: ColumnSource, reference: Reference) -> str:
+    """The line that gives a column its unit, with what is said of it already."""
+    attributes = [f"name = {source.quoted}", 'unit = "..."']
+    comment = f"unit is one of {', '.join(get_args(Unit))}"
+    if source.reference is not None or column is Column.PRESSURE:
+        attributes.append(f'reference = "{reference}"')
+    if column is Column.PRESSURE and source.reference is None:
+        comment += '; reference is "gauge" if the column is 0 at ambient'
+    if source.signal is not None and source.range is not None:
+        attributes.append(f"signal = {[*source.signal]}, range = {[*source.range]}")
+    elif source.line != (1.0, 0.0):
+        attributes.append(f"scale = {source.scale}, offset = {source.offset}")
+    return f"{column} = {{ {', '.join(attributes)} }}   # {comment}"
+
+
+def _electrical(source: ColumnSource, location: str) -> UnsaidError:
     unit, usual = _ELECTRICAL[_unit_of(source.name)]
-    return SourceError(
-        f"{location}: column {source.name!r} is in {unit}: which pressures do its ends mean?",
-        "say it under [import.columns] instead, for example: pressure ="
-        f' {{ name = {source.quoted}, signal = {usual}, range = [0, -1000], unit = "mbar",'
-        ' reference = "gauge" }',
+    text = f"column {source.name!r} is in {unit}, and nothing says which pressures its ends mean"
+    return UnsaidError(location, Unsaid(text, transmitter_line(source.name, usual)))
+
+
+def transmitter_line(name: str, signal: str) -> str:
+    """An example of a line of ``[import.columns]`` for a transmitter that gives ``signal``."""
+    return (
+        f"pressure = {{ name = {toml_string(name)}, signal = {signal}, range = [0, -1000],"
+        ' unit = "mbar", reference = "gauge" }'
+        "   # put in the pressures that these two numbers mean"
     )
