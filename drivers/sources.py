@@ -114,7 +114,7 @@ def _unknown(document: Document, kind: str) -> ConfigError:
     others = installed.installed()
     brought = "".join(f"; {name!r} comes with {package}" for name, package in others.items())
     return ConfigError(
-        f"{document.name}: unknown driver {kind!r}",
+        f"{document.place('driver', 'kind')}: unknown driver {kind!r}",
         f"{known_names(kind, [*BUILT_IN, *others])}{brought}; a driver for another PLC is a package"
         " of its own, docs/write-a-driver.md",
     )

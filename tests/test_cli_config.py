@@ -12,8 +12,8 @@ from command_line import twin
 from pydantic import BaseModel
 
 from twin.cli.config import json_schema, mistakes, sections
-from twin.keys import comments_of, defaults_of, tables_below
-from twin.settings import Document
+from twin.keys import ANY, comments_of, defaults_of, tables_below
+from twin.settings import BELOW, Document
 from twin.validation import alike, models_at, ordinal, path_in_words
 
 BAD = """\
@@ -101,6 +101,57 @@ def test_a_shipped_configuration_has_none(
 def test_what_only_several_keys_show_is_told_too(text: str, said: str) -> None:
     found = mistakes(Document.parse(text, "cell.toml"))
     assert any(said in line for line in found), found
+
+
+def test_a_persons_hours_and_zone_are_told_with_the_rest() -> None:
+    text = """[notifications.email]
+host = "mail"
+port = "x"
+[[notifications.people]]
+name = "Ann"
+address = "ann@plant.example"
+hours = "06:00-25:00"
+time_zone = "Europe/Atlantis"
+steep = 1
+[asset]
+type = "compact-ejector-35"
+"""
+    found = mistakes(Document.parse(text, "cell.toml"))
+    assert [line.partition(": ")[0] for line in found] == [
+        f"cell.toml:{number}" for number in (3, 7, 8, 9)
+    ]
+    assert "people, 1st entry, hours: must be two times of the day" in found[1]
+
+
+def test_a_driver_that_is_none_is_told_with_its_line() -> None:
+    found = mistakes(Document.parse('[driver]\nhost = "plc"\nkind = "modbsu"\n', "cell.toml"))
+    assert found[-1].startswith("cell.toml:3: unknown driver 'modbsu'; did you mean 'modbus'?")
+
+
+@pytest.mark.parametrize(
+    ("text", "table"),
+    [
+        ('[email]\nhost = "mail"', "[notifications.email]"),
+        ('[[people]]\nname = "Ann"', "[[notifications.people]]"),
+        ('[columns]\ntime = "Zeit"', "[import.columns]"),
+    ],
+)
+def test_a_table_that_belongs_below_another_is_told_its_place(text: str, table: str) -> None:
+    (found,) = mistakes(Document.parse(text, "cell.toml"))
+    assert found.startswith("cell.toml:1: unknown table [")
+    assert f"]; write {table}; known: " in found
+
+
+def test_a_place_that_is_told_exists() -> None:
+    tables = {
+        ".".join((section, *path)).removesuffix("[]")
+        for section, kinds in sections().items()
+        for kind in kinds.values()
+        for path, _ in tables_below(kind)
+    }
+    assert {table.strip("[]") for table in BELOW.values()} <= {
+        path.removesuffix(f".{ANY}") for path in tables
+    }
 
 
 def test_what_follows_from_a_mistake_is_not_told() -> None:

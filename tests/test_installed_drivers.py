@@ -206,7 +206,7 @@ def test_one_that_cannot_write_says_so(install: Install) -> None:
 
 def test_an_unknown_kind_names_what_there_is(install: Install) -> None:
     install("acme", GOOD)
-    with pytest.raises(ConfigError, match=r"cell.toml: unknown driver 'acne'") as caught:
+    with pytest.raises(ConfigError, match=r"cell.toml:2: unknown driver 'acne'") as caught:
         settings_of(table('kind = "acne"'))
     assert caught.value.hint.startswith(
         "did you mean 'acme'? known: acme, modbus, opcua; 'acme' comes with acme-drivers 2.1; "

@@ -22,6 +22,27 @@ ALL_MISTAKES = (
     " has all keys"
 )
 
+# Tables that people write at the top, and where they belong.
+BELOW = {
+    "ambient": "[data.ambient]",
+    "columns": "[import.columns]",
+    "ejector": "[data.ejector]",
+    "email": "[notifications.email]",
+    "parts": "[[data.system.parts]]",
+    "people": "[[notifications.people]]",
+    "rig": "[plc.rig]",
+    "ring": "[driver.ring]",
+    "security": "[driver.security]",
+    "sensor": "[data.sensor]",
+    "supply": "[data.supply]",
+    "system": "[data.system]",
+    "tags": "[driver.tags]",
+    "trace": "[driver.trace]",
+    "upload": "[outlets.upload]",
+    "user": "[driver.user]",
+    "valves": "[plc.valves]",
+}
+
 
 class Settings(BaseModel):
     """A table of the configuration: immutable, checked, finite numbers, without unknown keys."""
@@ -72,10 +93,15 @@ class Document:
         """ConfigError if a top-level table is none of ``names``."""
         for key in self.tables:
             if key not in names:
-                raise ConfigError(
-                    f"{self.name}:{self._line((key,))}: unknown table [{key}]",
-                    known_names(key, names),
-                )
+                hint = known_names(key, names)
+                whole = BELOW.get(key, "")
+                if whole.strip("[").partition(".")[0] in names:
+                    hint = f"write {whole}; {hint}"
+                raise ConfigError(f"{self.place(key)}: unknown table [{key}]", hint)
+
+    def place(self, *keys: str) -> str:
+        """File and line of a key or table, for messages."""
+        return f"{self.name}:{self._line(keys)}"
 
     def section(self, kind: type[S], *path: str) -> S:
         """Check the table at ``path`` (missing means all defaults) against its settings class."""

@@ -5,10 +5,10 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from email.errors import MessageError
 from email.headerregistry import Address as HeaderAddress
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from twin.alarms.rules import Priority
 from twin.notifications.message import EPOCH
@@ -32,35 +32,48 @@ def _checked_address(text: str) -> str:
     raise ValueError("no e-mail address: it has the form NAME@HOST, in plain letters")
 
 
+def _checked_name(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("has a line break, or a character that cannot be seen")
+    return text
+
+
+def _checked_hours(text: str) -> str:
+    if _minutes(text) is None:
+        raise ValueError(
+            'must be two times of the day such as "06:00-14:00", or "22:00-06:00" over midnight'
+        )
+    return text
+
+
+def _checked_zone(text: str) -> str:
+    try:
+        _zone(text)
+    except (ValueError, OSError, KeyError) as error:  # as zoneinfo has them for odd names
+        raise ValueError(
+            f'"{text}" is not known here: write one such as "Europe/Berlin"; if it is right,'
+            " install the package tzdata"
+        ) from error
+    return text
+
+
 Address = Annotated[str, AfterValidator(_checked_address)]
+Name = Annotated[str, AfterValidator(_checked_name)]
+Hours = Annotated[str, AfterValidator(_checked_hours)]
+Zone = Annotated[str, AfterValidator(_checked_zone)]
 
 
 class Person(Settings):
     """Somebody who is told of alarms while on duty; people of one ``step`` are a group."""
 
-    name: str = Field(min_length=1, max_length=100)  # as the mail addresses the person
+    name: Name = Field(min_length=1, max_length=100)  # as the mail addresses the person
     address: Address  # e-mail address, NAME@HOST
     weekdays: tuple[Weekday, ...] = Field(default=WEEKDAYS, min_length=1)  # days on duty
     # hours on duty; "22:00-06:00" ends on the day after
-    hours: str = ALWAYS
-    time_zone: str = ""  # zone of the hours, such as "Europe/Berlin"; empty: this machine's
+    hours: Hours = ALWAYS
+    time_zone: Zone = ""  # zone of the hours, such as "Europe/Berlin"; empty: this machine's
     from_priority: Priority = Priority.LOW  # less urgent alarms are not told
     step: int = Field(default=1, ge=1, le=20)  # 1 is told at once, each next one by escalation
-
-    @model_validator(mode="after")
-    def _is_sound(self) -> Self:
-        if not self.name.isprintable():
-            raise ValueError("name has a line break, or a character that cannot be seen")
-        if _minutes(self.hours) is None:
-            raise ValueError('hours are written as "06:00-14:00", or "22:00-06:00" over midnight')
-        try:
-            _zone(self.time_zone)
-        except (ValueError, OSError, KeyError) as error:  # as zoneinfo has them for odd names
-            raise ValueError(
-                f'time_zone "{self.time_zone}" is not known here: write one such as'
-                ' "Europe/Berlin"; if it is right, install the package tzdata'
-            ) from error
-        return self
 
     def is_told_of(self, priority: str) -> bool:
         """Whether alarms of this priority concern the person."""
