@@ -26,6 +26,10 @@ FILE_ONLY, PLACEHOLDER = "none: there are only files", "192.168.0.10:502"
 OPC_UA = "opc.tcp://"
 SIMULATED_NAMESPACE = "urn:ejector-twin:plc"  # of the simulated PLC
 SCHEMA = "twin.schema.json"
+_HEAD = (  # of each new file
+    f"#:schema ./{SCHEMA}",
+    f"# An editor then completes and checks keys: twin config schema > {SCHEMA}",
+)
 LAYOUTS = {  # pressure and commands in the simulated PLC and in docs/connect-your-plc.md
     ("modbus", True): ("30002", "30005/0", "30005/1"),
     ("modbus", False): ("40001", "00001", "00002"),
@@ -385,12 +389,16 @@ def _write(file: Path, text: str, *commands: str, force: bool) -> None:
 
 
 def _example(name: str) -> str:
-    """The text of a shipped configuration; ConfigError if there is none of that name."""
+    """The text of a shipped configuration below that of each new file.
+
+    ConfigError if there is none of that name.
+    """
     if name not in STARTERS:
         raise ConfigError(
             f"--starter {name}: there is no such example", known_names(name, STARTERS)
         )
-    return (_STARTERS / f"{name}.toml").read_text(encoding="utf-8")
+    shipped = (_STARTERS / f"{name}.toml").read_text(encoding="utf-8")
+    return "\n".join((*_HEAD, shipped))
 
 
 def _refuse_other_options(context: typer.Context, *allowed: str) -> None:
@@ -491,8 +499,7 @@ def configuration(
     note = "as on the nameplate" if is_known else "not known: a type of its own"
     first, second = next_commands(file, connection)
     lines = [
-        f"#:schema ./{SCHEMA}",
-        f"# An editor then completes and checks keys: twin config schema > {SCHEMA}",
+        *_HEAD,
         "# What a person knows of this ejector. What a calibration finds is kept in the asset",
         "# database, not here. docs/data-set.md has every key of [data].",
         f"# Next: {first}; then {second}",
