@@ -1,17 +1,23 @@
 """Causes named while the loop runs: from a rig with a small fault that begins, and is mended."""
 
 import gc
+import math
 import weakref
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 import rigs
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from twin.alarms import watch
 from twin.events import Event, Kind
 from twin.model.catalogue import CatalogueEffect
 from twin.model.effects import EFFECTS, UNKNOWN
+from twin.monitor import isolation
+from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle, CycleView, cut, figures
 from twin.monitor.healthy import Healthy
 from twin.monitor.isolation import Isolation, Verdict
@@ -342,3 +348,12 @@ def test_where_it_is_known_that_something_differs_the_causes_share_all_of_it() -
     assert found.none == 0.0
     assert [cause.share for cause in found.causes] == pytest.approx([0.75, 0.25])
     assert Verdict(1.0, ()).where_changed().causes == []
+
+
+@given(hnp.arrays(np.float64, 6, elements=st.floats(-1e6, 1e6)), st.integers(0, 100))
+def test_no_size_is_beyond_its_bounds(off: Floats, seed: int) -> None:
+    signatures = np.random.default_rng(seed).normal(size=(6, 3))
+    bounds = np.array([[-1.0, 1.0], [0.0, 2.0], [0.0, math.inf]])
+    sizes, _ = isolation._fitted(off[:, None], signatures, bounds)
+    assert (sizes >= bounds[:, 0]).all()
+    assert (sizes <= bounds[:, 1]).all()
