@@ -213,7 +213,7 @@ def test_a_supply_that_the_twin_cannot_have_is_refused() -> None:
 
 
 def test_on_another_supply_the_twin_is_judged_with_that_supply() -> None:
-    """Without it the twin as it stands is off by the supply, and the leak seems to gain little."""
+    """Without it the unchanged twin is off by the supply, and the leak seems to gain little."""
     log = recorded(1.0, 6, "leakage=2", supply_bar=4.2)
     log["supply"] = np.nan  # nobody measured it
     there = under(changed(supply={"pressure_bar": 4.2}))

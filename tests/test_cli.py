@@ -506,7 +506,7 @@ def test_a_log_has_the_ending_of_a_log(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("used", "left"), [(79_000, 2), (81_000, 1)])
-def test_without_a_word_old_logs_go_when_the_disk_is_four_fifths_full(
+def test_by_default_old_logs_go_when_the_disk_is_four_fifths_full(
     plc: PlcProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: int, left: int
 ) -> None:
     usage = SimpleNamespace(total=100_000, used=used, free=100_000 - used)

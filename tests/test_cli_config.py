@@ -54,7 +54,7 @@ SAID = (
     "14: driver.intervall_ms: unknown key: do you mean interval_ms?",
     "17: driver.tags.presure: unknown key: do you mean pressure?",
     '18: driver.tags.suction.address: "coil:99999999" is no address',
-    "21: import.columns.presure_mbar: is none that is known: do you mean pressure_mbar?",
+    "21: import.columns.presure_mbar: there is no key presure_mbar: do you mean pressure_mbar?",
     "24: monitor.false_alarm_days: must be a number (is 'six')",
     "25: monitor.isolate: must be true or false (is 'perhaps')",
     "27: unknown table [mqqt]; did you mean 'mqtt'?",
@@ -182,6 +182,20 @@ def test_paths_and_questions_in_words() -> None:
     )
     assert alike("presure", ["pressure", "suction"]) == "do you mean pressure?"
     assert alike("x", ["pressure", "suction"]) == "known are pressure, suction"
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("presure", "there is no key presure: do you mean pressure?"),
+        ("Druck", "there is no key Druck: known are ambient_mbar, blow_off, "),
+    ],
+)
+def test_a_key_that_there_is_not_is_called_so(key: str, said: str) -> None:
+    text = f'[asset]\ntype = "compact-ejector-35"\n[import.columns]\n{key} = "p"'
+    (found,) = mistakes(Document.parse(text, "cell.toml"))
+    assert found.startswith(f"cell.toml:4: import.columns.{key}: {said}")
+    assert "(is " not in found
 
 
 def test_kinds_of_tables_are_found_at_their_places() -> None:

@@ -273,7 +273,7 @@ def test_whatever_call_of_the_log_fails_no_row_is_lost(folder: Callable[[], Path
         assert other_ticks.tobytes() == ticks.tobytes(), at
         assert [event for event in other_events if event.kind not in OUTAGE] == events, at
         told = [event.kind for event in other_events if event.kind in OUTAGE]
-        # What goes wrong at the very end is mended without a word.
+        # What goes wrong at the very end is mended without an event.
         if number < without.calls[-12] and calls.sites[number][2] not in OVERLOOKED:
             assert told == list(OUTAGE), at
 

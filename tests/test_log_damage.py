@@ -112,7 +112,7 @@ def test_a_log_can_be_read_while_it_is_written(tmp_path: Path) -> None:
         assert sum(len(rows) for rows, _ in blocks) >= 90
 
 
-# A process that ends without a word.
+# A process that ends without closing its log.
 
 CHILD = """
 import resource, sys

@@ -92,7 +92,7 @@ def test_who_dies_is_reported_by_the_broker(running: Broker) -> None:
     ours.open()
     with Listener(running.port) as listener:
         listener.until("status", status="online")
-        ours.hang_up()  # without a word
+        ours.hang_up()  # without a goodbye
         assert listener.until("status", status="offline")["since"] is None
 
 

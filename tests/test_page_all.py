@@ -150,7 +150,7 @@ def test_the_worst_comes_first_and_unknown_is_never_green(told: Told) -> None:
         "leaks": "Leakage",
         "silent": "no values come",
         "stopped": "stopped",
-        "died": "gone without a word",
+        "died": "connection lost",
         "seen": "Leakage",
         "fine": "no alarm",
     }
@@ -382,9 +382,9 @@ def test_forty_ejectors_and_one_that_dies(tmp_path: Path, browser: Browser) -> N
         expect(lines.first).to_contain_text("cell-17")
         expect(lines.first).to_contain_text("Leakage")
         expect(page.locator("#counts")).to_have_text("1 with an alarm, 39 all right")
-        edges[5].hang_up()  # without a word
+        edges[5].hang_up()  # without a goodbye
         expect(page.locator("tr[data-name=cell-05]")).to_have_attribute("data-light", "grey")
-        expect(lines.nth(1)).to_contain_text("gone without a word")
+        expect(lines.nth(1)).to_contain_text("connection lost")
         expect(lines.nth(1)).to_contain_text("cell-05")
         page.fill("#search", "cell-2 b7")
         expect(lines).to_have_count(10)
@@ -500,7 +500,7 @@ def test_twin_run_is_on_the_page_of_twin_serve(tmp_path: Path) -> None:
             assert found["figures"][0]["measured"] == pytest.approx(189.0, abs=15.0)
             assert max(found["spark"]["high"]) > 500
             run.kill()
-            until(lambda: line()["what"] == "gone without a word")
+            until(lambda: line()["what"] == "connection lost")
 
 
 def until(is_so: Callable[[], Any]) -> None:

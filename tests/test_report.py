@@ -365,7 +365,7 @@ def test_without_a_cause_no_cause_is_claimed(pages: dict[str, str]) -> None:
     consistent = Outline(pages["consistent"]).headings
     assert consistent[1:] == [
         "What to do",
-        "The twin as it stands fits: 21.3 mbar rms",
+        "The unchanged twin fits: 21.3 mbar rms",
         "Over time: no cause comes or goes",
         "Every phase is as in healthy cycles",
         "Numbers",
@@ -376,7 +376,7 @@ def test_without_a_cause_no_cause_is_claimed(pages: dict[str, str]) -> None:
     )
     assert unlisted[2:4] == [
         "Something that no listed cause explains",
-        "The twin as it stands does not fit: 21.3 mbar rms",
+        "The unchanged twin does not fit: 21.3 mbar rms",
     ]
     assert "What no listed cause explains: blow-off: +22.5 mbar in the mean" in unlisted
     assert "<dt>it depends on</dt><dd>time</dd>" in pages["unlisted"]
@@ -424,7 +424,7 @@ def test_tables_carry_the_numbers(pages: dict[str, str]) -> None:
 
 def test_without_a_cause_the_table_has_no_gain(pages: dict[str, str]) -> None:
     page = pages["consistent"]
-    assert "twin as it stands</th>" in page
+    assert "unchanged twin</th>" in page
     assert '<td class="number">95.3' not in page
     assert "what can be gained" not in page
 
@@ -581,7 +581,7 @@ def test_a_long_name_beside_a_low_panel_has_several_lines() -> None:
 def test_cycle_is_drawn_before_and_after_with_a_cause_only() -> None:
     assert "expected with leakage" in as_svg(draw_cycle(found("explained"), 4, ""))
     healthy = as_svg(draw_cycle(found("consistent"), 4, ""))
-    assert "expected: twin as it stands" in healthy
+    assert "expected: unchanged twin" in healthy
     assert "expected with" not in healthy
 
 
@@ -604,8 +604,8 @@ def test_rms_of_a_cycle_is_that_of_its_rows() -> None:
 def test_log_shows_fitted_and_held_out_and_how_each_cause_runs() -> None:
     svg = as_svg(draw_log(found("two"), ""))
     for text in (
-        "twin as it stands, fitted",
-        "twin as it stands, held out",
+        "unchanged twin, fitted",
+        "unchanged twin, held out",
         "with all causes, held out",
         "leakage begins",
         ">(sl/min)<",

@@ -39,7 +39,7 @@ from twin.signals import Samples
 WORLDS = (battery_first.NAME, battery_second.NAME)
 MOST_ALIKE = 2  # mechanisms that an answer may name as not separable and still be right
 ENOUGH = 0.8  # share of the achievable reduction that is asked for
-NOT_WORSE = 1.02  # times the deviation of the twin as it stands: what chance in a log may add
+NOT_WORSE = 1.02  # times the deviation of the unchanged twin: what chance in a log may add
 AIR = ("inflow", "opening", "seepage")
 # Places and ways of acting that say what each hidden mechanism does; (): the grammar has none.
 RIGHT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -85,14 +85,14 @@ OF_VOLUME = {"creeping_cup", "blow_off_valve_leak"}
 
 
 def judged(diagnosis: Diagnosis, subject: Subject, change: Change) -> list[float]:
-    """Rms (mbar) under other conditions: the twin as it stands, extended, and the least possible.
+    """Rms (mbar) under other conditions: the unchanged twin, extended, and the least possible.
 
-    The last is that of the twin as it stands on a log in which nothing is hidden.
+    The last is that of the unchanged twin on a log in which nothing is hidden.
     """
     config, log = changed_config(subject.config, change), subject.record(change, True)
     healthy = _rms(config, subject.record(change, False))
     answer = judged_on(diagnosis, config, "other.mcap", [log])
-    if answer is None:  # nothing was found: the extended model is the twin as it stands
+    if answer is None:  # nothing was found: the extended model is the unchanged twin
         before = _rms(config, log)
         return [before, before, healthy]
     return [answer["baseline"]["rms_mbar"], answer["extended"]["rms_mbar"], healthy]
@@ -210,7 +210,7 @@ def share(rms: Sequence[float]) -> float | None:
 
 
 def is_worse(rms: Sequence[float]) -> bool:
-    """Whether the extended model is worse than the twin as it stands."""
+    """Whether the extended model is worse than the unchanged twin."""
     return rms[1] > NOT_WORSE * rms[0]
 
 
@@ -256,7 +256,7 @@ def summary(results: Sequence[Case]) -> str:
     reduced = [enough for enough in map(reduces, results) if enough is not None]
     return (
         f"Place and dependence are right in {right} of {len(results)} cases. Of {len(shares)} logs"
-        f" that the twin as it stands does not fit, the extended model has at least"
+        f" that the unchanged twin does not fit, the extended model has at least"
         f" {ENOUGH:.0%} of the achievable reduction in {sum(s >= ENOUGH for s in shares)}"
         f" (median {np.median(shares) if shares else 0.0:.0%}). It is worse than the twin as it"
         f" stands in {sum(map(is_worse, logs))} of {len(logs)} logs.\n\nIn {sum(reduced)} of"

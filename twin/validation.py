@@ -67,6 +67,9 @@ def in_words(problem: Mapping[str, Any], kind: type[BaseModel], loc: Sequence[st
 
     ``problem`` is one of Pydantic's errors.
     """
+    if loc and loc[-1] == "[key]" and problem["type"] in _CHOICES:
+        asked = str(problem["input"])
+        return f"there is no key {asked}: {alike(asked, _names(problem['ctx']['expected']))}"
     text = _text_of(problem, kind, loc)
     given = "" if problem["type"] in _IS_ENOUGH else f" (is {shorten(repr(problem['input']), 80)})"
     return text + given
@@ -146,14 +149,17 @@ def _text_of(problem: Mapping[str, Any], kind: type[BaseModel], loc: Sequence[st
 
 
 def _one_of(expected: str, given: object, label: str = "") -> str:
-    """The text for a choice; ``expected`` is in Pydantic's form: quoted, with commas."""
-    names = [name.strip(" '\"") for name in expected.replace(" or ", ", ").split(",")]
+    """The text for a choice among ``expected``."""
+    names = _names(expected)
     by_case = {name.lower(): name for name in names}
     nearest = get_close_matches(str(given).lower(), by_case, n=1)
     question = f": do you mean {by_case[nearest[0]]}?" if nearest else ""
-    if question and len(names) > _MOST_KEYS:
-        return f"{label}is none that is known{question}"
     return f"{label}must be {' or '.join(names)}{question}"
+
+
+def _names(expected: str) -> list[str]:
+    """The names of a choice that is in Pydantic's form: quoted, with commas."""
+    return [name.strip(" '\"") for name in expected.replace(" or ", ", ").split(",")]
 
 
 def alternatives(annotation: Any) -> Iterator[Any]:

@@ -101,8 +101,8 @@ def _refuse_rising(readings: Readings, ambient: float) -> NoReturn:
     highest = f"{readings.highest / MBAR:.0f}"
     if readings.deepest < NEVER_OPENED * ambient and readings.highest < ambient:
         raise ConfigError(
-            f"the pressure rises to {highest} mbar absolute while suction is commanded, from about"
-            " zero: it is vacuum, taken for absolute pressure",
+            f"the pressure rises from about zero to {highest} mbar under suction: it is vacuum,"
+            " taken for absolute pressure",
             f'set reference = "vacuum" of {TAG}',
         )
     if readings.highest - ambient > ambient - readings.deepest:

@@ -62,7 +62,7 @@ def diagnose(
         typer.Option(
             metavar="F.toml",
             callback=written_as(TOML),
-            help="Write what acts, unlisted, for twin effects add.",
+            help="Write the unlisted mechanism that was found, for twin effects add.",
         ),
     ] = None,
 ) -> None:

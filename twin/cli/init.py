@@ -580,7 +580,7 @@ def _no_driver(sensor: Sensor) -> list[str]:
         "# --- files of another program: docs/csv.md --------------------------------------",
         "",
         "[import]",
-        '# time_zone = "Europe/Berlin"   # of times that say none',
+        '# time_zone = "Europe/Berlin"   # zone of times without one',
         "",
         "[import.columns]",
         '# time_s = "Time"               # the file\'s names, where they are others',

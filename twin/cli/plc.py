@@ -52,7 +52,7 @@ def plc(
 
 
 def probe(config: ConfigFile, address: Address = "") -> None:
-    """Say what a PLC at the configured address answers, word order included."""
+    """Say what a PLC answers at its address, and in which word order."""
     from drivers.sources import probe_source
 
     for line in probe_source(read_config(config), address):

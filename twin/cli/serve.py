@@ -61,9 +61,9 @@ def serve(
 ) -> None:
     """Show traffic light, alarms, live pressure and trends in a browser; Ctrl-C ends it.
 
-    A process of its own: it shows what twin run leaves, and stays when that ends. To acknowledge
-    needs a login (twin users), and so does everything where others reach it. With --broker
-    it shows what all ejectors publish, beside those of --config or alone.
+    It is a process of its own: it shows what twin run writes, and goes on after twin run ends. To
+    acknowledge needs a login (twin users), and so does everything where others reach it. With
+    --broker it shows what all ejectors publish, beside those of --config or alone.
     """
     require("serve", "twin serve")
     from twin.config import Config

@@ -48,7 +48,7 @@ def import_(
         typer.Option(
             metavar="ZONE",
             callback=_known_zone,
-            help="Of times that say none, as Europe/Berlin or UTC.",
+            help="Zone of times without one: Europe/Berlin, or UTC.",
         ),
     ] = "",
     derive_commands: Annotated[

@@ -45,7 +45,7 @@ def judged_on(
     blocks: Iterable[Samples],
     there: Config | None = None,
 ) -> dict[str, Any] | None:
-    """Figures of the twin as it stands and of the extended model on ``log``; None without one.
+    """Figures of the unchanged twin and of the extended model on ``log``; None without one.
 
     All whole cycles of the log count, whatever their program. ``there`` is the configuration under
     the conditions of that log (``conditions``). Intermittent causes are left out, and so are curves

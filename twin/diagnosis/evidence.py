@@ -1,6 +1,6 @@
 """The complete cycles of a log, and the residuals of any hypothesis in them.
 
-A hypothesis is a set of causes; the calibrated twin as it stands is the empty one. Its residuals
+A hypothesis is a set of causes; the calibrated unchanged twin is the empty one. Its residuals
 are measured minus expected pressure, averaged over short bins, and measured minus expected vacuum
 at the switchings of the air saving.
 """

@@ -58,7 +58,7 @@ def _deviations(axes: Axes, diagnosed: Found) -> None:
     scale, _ = _scale(evidence)
     times = _middles(evidence)[shown] / scale
     held = np.isin(shown, diagnosed.held_out)
-    models = [(diagnosed.before, BEFORE, 8.0, tr("twin as it stands"))]
+    models = [(diagnosed.before, BEFORE, 8.0, tr("unchanged twin"))]
     if diagnosed.extended:
         with_causes = tr("with {causes}", causes=diagnosed.name)
         models.append((diagnosed.after, AFTER, 5.0, with_causes))

@@ -94,7 +94,7 @@ def healthy_sigma(evidence: Evidence, laid: Laid) -> Floats:
 
 
 def worst_kind(diagnosed: Found, laid: Laid) -> tuple[str, float, float]:
-    """Kind of stretch with the largest deviation of the twin as it stands; rms before, after."""
+    """Kind of stretch with the largest deviation of the unchanged twin; rms before, after."""
     before, after = (
         laid.mean(judged.off[laid.bins]) for judged in (diagnosed.before, diagnosed.after)
     )

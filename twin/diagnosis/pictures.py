@@ -70,7 +70,7 @@ class Found:
 
     @property
     def extended(self) -> bool:
-        """Whether the extended model differs from the twin as it stands."""
+        """Whether the extended model differs from the unchanged twin."""
         return bool(self.causes or self.terms)
 
     @property
@@ -98,7 +98,7 @@ def spread(cycles: Sequence[int], most: int) -> Ints:
 
 
 def worst_cycle(diagnosed: Found) -> int:
-    """The held-out cycle with the largest deviation of the twin as it stands."""
+    """The held-out cycle with the largest deviation of the unchanged twin."""
     return diagnosed.held_out[int(np.argmax(diagnosed.before.squares))]
 
 
@@ -124,7 +124,7 @@ def draw_cycle(diagnosed: Found, cycle: int, alt: str) -> Picture:
 
 
 def _models(diagnosed: Found) -> list[tuple[Judged, str, str, str]]:
-    before = (diagnosed.before, tr("expected: twin as it stands"), BEFORE, "--")
+    before = (diagnosed.before, tr("expected: unchanged twin"), BEFORE, "--")
     if not diagnosed.extended:
         return [before]
     with_causes = tr("expected with {causes}", causes=diagnosed.name)
@@ -172,7 +172,7 @@ def _ranked(diagnosed: Found) -> list[tuple[str, float, str]]:
     rows += [(_named(fitted), fitted.leftover, PALE) for fitted in rest[:MOST_RANKED]]
     count = search.ranking[0].count
     none = float(np.sqrt(search.healthy / count))
-    return [*rows, (tr("no cause: the twin as it stands"), none, "#ffffff")]
+    return [*rows, (tr("no cause: the unchanged twin"), none, "#ffffff")]
 
 
 def _key(fitted: Fitted) -> tuple[str, ...]:

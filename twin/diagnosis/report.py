@@ -337,8 +337,8 @@ def _verdict_in_numbers(answer: Answer) -> str:
             term = tr("the mechanism") if mechanism_of(answer) else tr("a term from data")
             rms = tr("{rms} with {term}", rms=rms, term=term)
         if answer["verdict"] == "consistent":
-            return tr("The twin as it stands fits: {rms}", rms=rms)
-        return tr("The twin as it stands does not fit: {rms}", rms=rms)
+            return tr("The unchanged twin fits: {rms}", rms=rms)
+        return tr("The unchanged twin does not fit: {rms}", rms=rms)
     count = len(answer["causes"])
     causes = capital(listed([sized(cause) for cause in answer["causes"]]))
     if answer["verdict"] == "explained":
@@ -434,7 +434,7 @@ def _parameters(answer: Answer, times: Times) -> Iterator[tuple[str, ...]]:
 
 def _gain_table(answer: Answer) -> str:
     """The figures on held-out cycles, before and, with an extended model, after."""
-    columns, caption = {"baseline": tr("twin as it stands")}, tr("Held-out cycles")
+    columns, caption = {"baseline": tr("unchanged twin")}, tr("Held-out cycles")
     if extended(answer):
         columns = {"baseline": tr("before"), "extended": tr("after")}
         caption = tr("Gain on held-out cycles")

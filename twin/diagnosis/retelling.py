@@ -169,8 +169,8 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     " the column",
     "the pressure moves by {size} mbar only in the whole record: no vacuum is made",
     "check the unit and the range of [driver.tags.pressure], or of the column",
-    "the pressure rises to {highest} mbar absolute while suction is commanded, from about zero: it"
-    " is vacuum, taken for absolute pressure",
+    "the pressure rises from about zero to {highest} mbar under suction: it is vacuum, taken for"
+    " absolute pressure",
     'set reference = "vacuum" of [driver.tags.pressure], or of the column',
     "the pressure rises to {highest} mbar absolute while suction is commanded: its sign is wrong",
     'set reference = "gauge" (falls in suction) or "vacuum" (rises) of [driver.tags.pressure], or'

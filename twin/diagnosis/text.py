@@ -348,7 +348,7 @@ def cost(cause: Answer) -> str:
 
 
 def change(answer: Answer, key: str) -> str:
-    """A figure of the twin as it stands, and of the extended model if there is one."""
+    """A figure of the unchanged twin, and of the extended model if there is one."""
     before, after = (number(answer[part][key]) for part in ("baseline", "extended"))
     return f"{before} → {after}" if extended(answer) else before
 

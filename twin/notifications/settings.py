@@ -126,7 +126,7 @@ class UploadSettings(HttpSettings):
 
     logs: Path  # where twin run writes them; nothing else is ever uploaded
     folder: Path | None = None  # or a folder, which may be a share
-    timeout_s: float = Field(default=60.0, gt=0.0, le=600.0)  # without a word
+    timeout_s: float = Field(default=60.0, gt=0.0, le=600.0)  # longest silence of the server
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:

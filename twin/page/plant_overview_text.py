@@ -122,7 +122,7 @@ def _without_alarm(ejector: EjectorMessages, words: str) -> str:
     if words == WORDS[Light.GREY]:
         died = ejector.status == "offline" and ejector.since is None
         reason = tr("stopped") if ejector.status else tr("never came")
-        return tr("gone without a word") if died else reason
+        return tr("connection lost") if died else reason
     return tr("no values come") if words == SILENT else "" if words == NOT_KNOWN else tr("no alarm")
 
 

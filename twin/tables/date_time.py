@@ -109,7 +109,7 @@ class Calendar:
         if self.zone is None:
             raise SourceError(
                 f"{self.location}: {NO_ZONE}",
-                'say it under [import]: time_zone = "Europe/Berlin", or --time-zone (UTC is one)',
+                'write under [import]: time_zone = "Europe/Berlin" (or UTC), or give --time-zone',
             )
         first, last = (
             pc.assume_timezone(naive, self.zone, ambiguous=choice, nonexistent=choice).cast(

@@ -65,7 +65,7 @@ class Preview:
                 description = f"{name.partition('_')[0]} in {meaning}"
             elif name is Column.TIME:
                 description = (
-                    f"date and time, {f'where it says none in {zone}' if zone else 'as it says'}"
+                    f"date and time, {f'in {zone} where no zone stands' if zone else 'as it says'}"
                 )
             elif name in TIMES:
                 description = f"time in {name.rpartition('_')[2]}"

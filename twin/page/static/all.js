@@ -144,7 +144,7 @@ function showPlots() {
     select.value = names.includes(before) ? before : names[0] || "";
   }
   const trend = one.trends.find((each) => each.name === select.value);
-  $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : t("No cycle has been told yet.");
+  $("figure-what").textContent = trend ? `${trend.what}, ${trend.unit}` : t("No cycle has been reported yet.");
   const { time: at, measured, expected: beside, unit } = trend || { time: [], measured: [], expected: [], unit: "" };
   draw("figure", unit, [{ time: at, low: measured }, { time: at, low: beside }]);
 }

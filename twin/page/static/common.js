@@ -1,7 +1,7 @@
 // What the pages share. What comes from the server is put in as text, never as markup.
 "use strict";
 
-const SILENT_MS = 5000; // without a word from the page's own server
+const SILENT_MS = 5000; // since the page's own server said something
 
 const $ = (id) => document.getElementById(id);
 let skew = 0; // seconds that the server's clock is ahead of the one here
