@@ -352,6 +352,16 @@ def test_exports_of_plc_tools_are_read(name: str) -> None:
     assert rows["pressure"].min() == pytest.approx(AMBIENT - 70_000.0, abs=1.0)
 
 
+@pytest.mark.parametrize("program", ["CODESYS Trace", "S7-1500, S7-1200"])
+def test_the_page_says_which_exports_were_never_tried_with_a_real_file(program: str) -> None:
+    """Take this away for a program once ``tests/data`` has a file that it wrote."""
+    assert "None was written by the program itself" in (DATA / "README.md").read_text("utf-8")
+    page = (DATA.parents[1] / "docs" / "csv.md").read_text(encoding="utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| {program} |"))
+    assert "Tested with a file that this project wrote itself" in row
+    assert "not yet with an export of the program" in row
+
+
 def test_a_scope_file_with_whole_time_stamps(tmp_path: Path) -> None:
     lines = (DATA / "trace_twincat_scope.txt").read_text(encoding="utf-8-sig").splitlines()
     whole = [
