@@ -50,10 +50,10 @@ class Listening:
     """Times the blocks of a live source; a replay needs none of it."""
 
     clock: Callable[[], int] = time.perf_counter_ns  # monotonic
-    # While the run loads its model the twin may be late: that is no sign of a busy machine.
-    is_starting: Callable[[], bool] = lambda: False
     notices: Notices = field(default_factory=Notices)
     answer: LastRow = field(default_factory=LastRow)  # before the loop; given if none comes to it
+    # While the run loads its model the twin may be late: that is no sign of a busy machine.
+    is_starting: Callable[[], bool] = lambda: False
     _last: LastRow = field(default_factory=LastRow)  # that is not stale
     _heard_ns: int = 0  # its time of receipt, by ``clock``
     _listened_ns: int = 0  # since then
