@@ -1,8 +1,10 @@
 """Rows that are read ahead of the loop: all of them, in order, judged by when they came."""
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from itertools import count
 
 import numpy as np
 import pytest
@@ -59,6 +61,28 @@ def test_the_loop_reads_on_by_itself_once_it_has_caught_up() -> None:
     assert came == [100 * MS * number for number in range(1, 9)]
     assert source.threads[4] is not threading.current_thread()
     assert source.threads[7] is threading.current_thread()
+
+
+def test_a_source_faster_than_the_loop_is_read_ahead_no_longer() -> None:
+    """Such as a file: all of it would wait in memory."""
+    readers = list[threading.Thread]()
+
+    def fast() -> Iterator[Samples]:
+        for first in count(0, 10):
+            readers.append(threading.current_thread())
+            yield rows(10, first)
+
+    came = list[int]()
+    with closing(Acquisition(fast(), ahead=True)) as ahead:
+        assert ahead._thread is not None
+        for block in ahead.blocks():
+            came.append(int(block["sequence"][0]))
+            assert len(came) < 1_000_000
+            if readers[-1] is threading.current_thread():
+                break
+            while len(readers) < 2 * len(came) and ahead._thread.is_alive():
+                time.sleep(0.001)
+    assert came == list(range(0, 10 * len(came), 10))
 
 
 def test_without_reading_ahead_no_thread_is_there() -> None:

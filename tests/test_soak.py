@@ -51,7 +51,7 @@ def cycles() -> Samples:
 @pytest.mark.slow
 def test_rows_go_on_for_ever(cycles: Samples) -> None:
     told: list[float] = []
-    blocks = soak.endless(cycles, told.append)
+    blocks = soak.endless(cycles, told.append, lambda: True)
     rows = np.concatenate([*islice(blocks, 2 * len(cycles) // soak.BLOCK + 4)])
     assert len(rows) > 2 * len(cycles)
     assert (np.diff(rows["sequence"]) == 1).all()

@@ -99,8 +99,13 @@ def stretch(settings: PlcSettings) -> Samples:
     return samples[begins[1] : begins[-1]]  # each begins as the one before
 
 
-def endless(cycles: Samples, report_hours: Callable[[float], None]) -> Iterator[Samples]:
-    """Endless blocks of ``cycles``; ``report_hours`` gets the hours taken so far."""
+def endless(
+    cycles: Samples, report_hours: Callable[[float], None], is_logging: Callable[[], bool]
+) -> Iterator[Samples]:
+    """Endless blocks of ``cycles``; ``report_hours`` gets the hours taken so far.
+
+    After the first block it waits for the log: a run reads ahead while it loads its model.
+    """
     period_ns = int(cycles["time_ns"][1] - cycles["time_ns"][0])
     rounds = 0
     while True:
@@ -110,6 +115,9 @@ def endless(cycles: Samples, report_hours: Callable[[float], None]) -> Iterator[
             for name in ("time_ns", "host_ns"):
                 block[name] += rounds * len(cycles) * period_ns
             yield block
+            while not is_logging():
+                time.sleep(LEAST_S)
+                yield block[:0]
             report_hours((rounds * len(cycles) + start + len(block)) * period_ns / 3.6e12)
         rounds += 1
 
@@ -127,7 +135,7 @@ def run_compressed(config: Path, log: Path, progress: Path) -> None:
             file.write(f"{hours:.6f}\n")
             file.flush()
 
-        sources.open_source = lambda *_given, **_named: endless(cycles, told)
+        sources.open_source = lambda *_given, **_named: endless(cycles, told, log.exists)
         sys.argv = ["twin", "run", str(config), "--log", str(log)]
         run_command()
 

@@ -1,5 +1,6 @@
 """The rows of a live source; they may be read ahead, while the model is still compiled."""
 
+import sys
 import threading
 import time
 from collections import deque
@@ -45,8 +46,16 @@ class Acquisition:
         return self._came_ns is not None
 
     def blocks(self) -> Iterator[Samples]:
-        """All blocks in their order; raises what the source raised, after what came before."""
-        yield from self.waiting()
+        """All blocks in their order; raises what the source raised, after what came before.
+
+        A source that gives rows faster than the loop takes them is read ahead no longer.
+        """
+        behind = self._rows
+        while behind:
+            yield from self.waiting(len(self._waiting))
+            behind, before = self._rows, behind
+            if behind >= before:
+                break
         self.close()
         yield from self.waiting()  # what came until the thread had ended
         if self._error is not None:
@@ -54,9 +63,12 @@ class Acquisition:
         self._came_ns = None
         yield from self._source
 
-    def waiting(self) -> Iterator[Samples]:
-        """The blocks that wait, the oldest first, until none does."""
-        while (oldest := self._take_oldest(0)) is not None:
+    def waiting(self, most: int = sys.maxsize) -> Iterator[Samples]:
+        """The blocks that wait, the oldest first, until none does or ``most`` came."""
+        for _ in range(most):
+            oldest = self._take_oldest(0)
+            if oldest is None:
+                return
             self._came_ns, block = oldest
             yield block
 
