@@ -14,6 +14,7 @@ import json
 import signal
 import sys
 import tempfile
+import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -100,11 +101,12 @@ def stretch(settings: PlcSettings) -> Samples:
 
 
 def endless(
-    cycles: Samples, report_hours: Callable[[float], None], is_logging: Callable[[], bool]
+    cycles: Samples, report_hours: Callable[[float], None], is_live: Callable[[], bool]
 ) -> Iterator[Samples]:
     """Endless blocks of ``cycles``; ``report_hours`` gets the hours taken so far.
 
-    After the first block it waits for the log: a run reads ahead while it loads its model.
+    After the first block it waits until the loop reads it: a run reads ahead while it loads its
+    model.
     """
     period_ns = int(cycles["time_ns"][1] - cycles["time_ns"][0])
     rounds = 0
@@ -115,7 +117,7 @@ def endless(
             for name in ("time_ns", "host_ns"):
                 block[name] += rounds * len(cycles) * period_ns
             yield block
-            while not is_logging():
+            while not is_live():
                 time.sleep(LEAST_S)
                 yield block[:0]
             report_hours((rounds * len(cycles) + start + len(block)) * period_ns / 3.6e12)
@@ -135,7 +137,10 @@ def run_compressed(config: Path, log: Path, progress: Path) -> None:
             file.write(f"{hours:.6f}\n")
             file.flush()
 
-        sources.open_source = lambda *_given, **_named: endless(cycles, told, log.exists)
+        def is_live() -> bool:
+            return threading.current_thread() is threading.main_thread()
+
+        sources.open_source = lambda *_given, **_named: endless(cycles, told, is_live)
         sys.argv = ["twin", "run", str(config), "--log", str(log)]
         run_command()
 
