@@ -4,6 +4,7 @@ Run as a program it is that child: it makes the twins of the configurations on s
 all that they need in the cache.
 """
 
+import gc
 import pickle
 import sys
 import threading
@@ -41,6 +42,7 @@ class Models:
         self._one_at_a_time = threading.Lock()  # who loads, takes a pair, or looks for the child
         if at_once:
             self._make_all()
+            gc.collect()  # compiling leaves garbage, which a loop would never collect
 
     def load(self) -> None:
         """Make all pairs if they are in the cache, else have them compiled; once for all."""

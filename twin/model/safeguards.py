@@ -1,4 +1,4 @@
-"""Safeguards of the compact ejector's own control, as its manual gives them."""
+"""Safeguards of the compact ejector's own control: valve protection, and judging leakage."""
 
 PROTECTED_SWITCHES = 6  # more switchings than this within PROTECTED_S mean continuous suction
 PROTECTED_S = 3.0  # s
