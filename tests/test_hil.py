@@ -12,7 +12,6 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -600,12 +599,21 @@ def test_what_cannot_be_in_the_loop_is_said(
 # The whole loop, in three processes.
 
 
-def observed(port: int, seconds: float) -> Samples:
-    """What the PLC has in its trace: its commands, and the pressure it was given."""
-    source = modbus.blocks(driver(port))
-    end = time.monotonic() + seconds
-    with closing(source):
-        return np.concatenate(list(takewhile(lambda _: time.monotonic() < end, source)))
+def observed(port: int, picks: int) -> Samples:
+    """What the PLC has in its trace until suction has begun so often: what it commanded and saw."""
+    end = time.monotonic() + PATIENCE_S
+    rows: list[Samples] = []
+    with closing(modbus.blocks(driver(port))) as source:
+        for block in source:
+            rows.append(block)
+            if len(suction_starts(np.concatenate(rows))) >= picks or time.monotonic() > end:
+                break
+    return np.concatenate(rows)
+
+
+def suction_starts(samples: Samples) -> np.ndarray:
+    """The rows before which suction was off and at which it is on, shape (picks,)."""
+    return np.flatnonzero(np.diff((samples["commands"] & Command.SUCTION).astype(int)) == 1)
 
 
 def latency_ms(model: Samples, plc: Samples) -> np.ndarray:
@@ -649,7 +657,7 @@ def test_a_plcs_program_runs_on_the_models_answers(name: str, tmp_path: Path) ->
         assert status(plc.port) == TRIPPED
         with running(*command, "--log", log) as process:
             until(lambda: status(plc.port) == Command.SUCTION, PATIENCE_S)
-            seen = observed(plc.port, 8.0)
+            seen = observed(plc.port, 4)
             assert process.poll() is None, process.communicate()
             process.kill()
             process.wait()
@@ -659,7 +667,7 @@ def test_a_plcs_program_runs_on_the_models_answers(name: str, tmp_path: Path) ->
                 again.send_signal(signal.SIGINT)
                 assert again.wait(PATIENCE_S) == 130
     suction = (seen["commands"] & Command.SUCTION).astype(int)
-    picks = np.flatnonzero(np.diff(suction) == 1)[1:]
+    picks = suction_starts(seen)[1:]
     assert len(picks) >= 3
     written = open_log(log)
     assert "model's own" in written.header.metadata["hil"]
