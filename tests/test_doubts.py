@@ -68,7 +68,7 @@ def fitted_with(determined: bool = True, **ejector: float) -> Fitted:
     )
     sigma = 0.01 * fitted.prior if determined else fitted.prior
     covariance = np.diag(sigma**2)
-    return replace(fitted, data=data, covariance=covariance, parameter_covariance=covariance)
+    return replace(fitted, data=data, covariance=covariance, factor=np.linalg.cholesky(covariance))
 
 
 def test_a_value_far_from_its_type_is_told() -> None:

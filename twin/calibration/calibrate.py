@@ -229,9 +229,7 @@ def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[fl
 
     ``untold`` has sigmas of values that no log shows and nobody configured.
     """
-    factor = block_diag(
-        np.linalg.cholesky(fitted.parameter_covariance), np.diag([*untold.values()])
-    )
+    factor = block_diag(fitted.factor, np.diag([*untold.values()]))
     names = [*(free.name for free in fitted.free), *untold]
     return {
         name: tuple(float(f"{change:.4g}") for change in row[: number + 1])

@@ -24,6 +24,7 @@ from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
 from twin.model.parts import Tube
+from twin.monitor.uncertain_data import both_sides
 from twin.quality import UNUSABLE
 from twin.signals import MBAR, MS, NS, Samples
 
@@ -77,6 +78,9 @@ NARROWING = (
 )
 # The end of that, once more from its result: with a wide error a search leaves a local end.
 AGAIN = NARROWING[3:]
+# Most that one sigma of the parameters may raise chi-square, and halvings until it does. A linear
+# model rises by 1 at most; chosen: one that bends may rise by as much as two sigmas of that.
+MOST_RISE, MOST_HALVINGS = 4.0, 8
 # Sigmas beyond which the robust loss grows more slowly than the square of a residual.
 ROBUST = 8.0
 
@@ -111,6 +115,17 @@ class Problem:
         row = np.full(len(x) - n, 1.0 / self._rows)
         steps = np.append(inside(x[:n], self.space.high, self.space.step), row)
         return sensitivities(self._predict, self._whole(x), steps)[1]
+
+    def jacobian_both_ways(self, x: Floats) -> Floats:
+        """Mean of the derivatives of ``residual`` forwards and backwards, without nozzle's time.
+
+        Where a part just fails to reach its stop, the model has a kink: one side alone shows
+        nothing. Next to a bound there is one side.
+        """
+        forwards = inside(x, self.space.high, self.space.step)
+        backwards = np.where(x - self.space.step >= self.space.low, -self.space.step, forwards)
+        sides = [sensitivities(self._predict, x, steps)[1] for steps in (forwards, backwards)]
+        return np.asarray(np.mean(sides, axis=0), np.float64)
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -173,8 +188,8 @@ class Fitted:
     data: DataSet
     free: tuple[Free, ...]
     covariance: Floats  # of the free parameters, in their units
-    # The covariance without the model's discrepancy: other logs may narrow it.
-    parameter_covariance: Floats
+    # Factor of the covariance without the model's discrepancy: other logs may narrow it.
+    factor: Floats
     prior: Floats  # sigma of each before the log, in its unit
     left: float  # Pa rms of the residual in the fitted cycles
     scaled: npt.NDArray[np.bool_]  # parameters whose logarithm is normally distributed
@@ -425,7 +440,7 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     best = DataSet.model_validate(falling(space.at(x)).model_dump())
     slopes = space.slopes(x)
     residuals = cycles.residuals(np.stack(with_left_out(best), axis=1))
-    jacobian = problem.jacobian(x)
+    jacobian = problem.jacobian_both_ways(x)
     plain = np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64)
     covariance = (
         slopes @ _with_left_out(plain, jacobian, problem.weights.white(residuals)) @ slopes.T
@@ -433,8 +448,40 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     prior = np.sqrt(np.diag(slopes @ slopes.T))
     first_residual = residuals[: len(cycles.bins.count), 0]
     rms = float(np.sqrt(np.average(first_residual**2, weights=cycles.bins.count)))
-    parameter_covariance = slopes @ plain @ slopes.T
-    return Fitted(best, space.free, covariance, parameter_covariance, prior, rms, space.scaled)
+    root = np.asarray(np.linalg.cholesky(slopes @ plain @ slopes.T), np.float64)
+    factor = _allowed(problem, best, root)
+    return Fitted(best, space.free, covariance, factor, prior, rms, space.scaled)
+
+
+def _allowed(problem: Problem, best: DataSet, factor: Floats) -> Floats:
+    """``factor`` of a covariance of parameters, its columns as long as the record allows.
+
+    The covariance counts the model as linear. Where that bends, one sigma of a column may
+    contradict the record, on one side at least: then the column is halved until it does not.
+    """
+
+    def misfit(datasets: Sequence[DataSet]) -> Floats:
+        residuals = problem.cycles.residuals(np.stack([*map(coefficients, datasets)], axis=1))
+        chi2: Floats = np.sum(np.concatenate(problem.weights.white(residuals)) ** 2, axis=0)
+        return chi2
+
+    names = [free.name for free in problem.space.free]
+    (least,) = misfit([best])
+    residual_count = sum(len(rows) for rows, _ in problem.weights.parts)
+    most = float(least) + MOST_RISE * max(float(least) / residual_count, 1.0)
+    factor = factor.copy()
+    too_long = np.arange(len(names))
+    for _ in range(MOST_HALVINGS):
+        sides = [
+            side
+            for column in too_long
+            for side in both_sides(best, dict(zip(names, factor[:, column].tolist(), strict=True)))
+        ]
+        too_long = too_long[misfit(sides).reshape(-1, 2).max(axis=1) > most]
+        if not len(too_long):
+            break
+        factor[:, too_long] /= 2.0
+    return factor
 
 
 def _with_left_out(covariance: Floats, jacobian: Floats, white: Sequence[Floats]) -> Floats:

@@ -44,11 +44,12 @@ def shifted(data: DataSet, healthy: Healthy) -> Iterator[Shift]:
     """
     for key, (_, share) in SUPPLY_LAW.items():
         value = getattr(data.supply, key)
-        yield Shift(*_both_sides(data, {f"supply.{key}": share * value}))
+        yield Shift(*_coefficients(both_sides(data, {f"supply.{key}": share * value})))
     rows = list(healthy.uncertain.items())
     for way in range(len(rows)):
         tied = any(abs(row[way]) > TIES * math.hypot(*row) for _, row in rows[way + 1 :])
-        yield Shift(*_both_sides(data, {name: row[way] for name, row in rows[way:]}), tied)
+        sides = both_sides(data, {name: row[way] for name, row in rows[way:]})
+        yield Shift(*_coefficients(sides), tied)
 
 
 def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
@@ -80,9 +81,13 @@ def scattered(theta: Theta, healthy: Healthy, rng: np.random.Generator) -> Theta
     return theta
 
 
-def _both_sides(data: DataSet, changes: Mapping[str, float]) -> tuple[Theta, Theta]:
-    """Coefficients with values (``table.key``) changed by ``changes``, and by their negatives."""
-    up, down = (_changed(data, changes, sign) for sign in (1.0, -1.0))
+def both_sides(data: DataSet, changes: Mapping[str, float]) -> tuple[DataSet, DataSet]:
+    """Data sets with values (``table.key``) changed by ``changes``, and by their negatives."""
+    return _changed(data, changes, 1.0), _changed(data, changes, -1.0)
+
+
+def _coefficients(sides: tuple[DataSet, DataSet]) -> tuple[Theta, Theta]:
+    up, down = sides
     return coefficients(up), coefficients(down)
 
 
