@@ -25,9 +25,9 @@ import twin
 from drivers.plc.faults import parse_fault
 from tools.tutorial_data import CYCLES, write_data
 from twin.assets.database import open_assets
-from twin.calibration.calibrate import Remark
 from twin.calibration.commission import Commissioned as Commissioning
 from twin.calibration.readings import read
+from twin.calibration.record_checks import Remark
 from twin.calibration.verdict import Residual, Verdict
 from twin.config import Config
 from twin.diagnosis.curves import outline

@@ -13,6 +13,7 @@ import rigs
 from calibrations import log_of, quiet, typed
 from hypothesis import given
 from hypothesis import strategies as st
+from miswired import counted, no_blow_off, swapped
 from second_rigs import UNKNOWN_TYPE, config_of, samples_of
 from second_world.draw import draw_rig
 from second_world.faults import Fault
@@ -594,20 +595,6 @@ def refused(samples: Samples) -> str:
     return str(error.value)
 
 
-def swapped(samples: Samples) -> None:
-    suction, blow_off = (samples["commands"] & bit for bit in (1, 2))
-    samples["commands"] = suction * 2 + blow_off // 2
-
-
-def counted(scale: float, offset: float) -> Callable[[Samples], None]:
-    """The pressure as another unit or reference has it; ``offset`` in ambient pressures."""
-
-    def change(samples: Samples) -> None:
-        samples["pressure"] = scale * samples["pressure"] + offset * np.float32(101300.0)
-
-    return change
-
-
 @pytest.mark.parametrize("name", ["gripper", "test_rig", "second world"])
 @pytest.mark.parametrize(
     ("wrong", "said"),
@@ -634,7 +621,7 @@ def test_what_is_connected_wrongly_is_recognised_from_the_curves(
 
 def test_blow_off_that_no_row_commands_is_told_where_the_curve_shows_it() -> None:
     here = samples_of(logged(SEED, KIND))
-    here["commands"] &= np.uint8(Command.SUCTION)
+    no_blow_off(here)
     assert "no row has blow-off commanded" in refused(here)
     _, remarks = guessed(typed("gripper").data, read(here))
     assert any("no row of the record has blow-off" in remark.text for remark in remarks)

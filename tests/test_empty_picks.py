@@ -5,9 +5,9 @@ import pytest
 import rigs
 from calibrations import log_of, typed
 
-from twin.calibration.calibrate import picked
 from twin.calibration.empty_picks import without_empty_picks
 from twin.calibration.readings import Stretch, stretches
+from twin.calibration.record_checks import picked
 from twin.diagnosis.evidence import read_cycles
 from twin.events import Event, Kind
 from twin.signals import Command, Samples

@@ -19,8 +19,8 @@ import drivers.sources
 from drivers.reconnect import EMPTY
 from twin import files
 from twin.assets.database_url import open_chosen
-from twin.calibration.calibrate import FEWEST
 from twin.calibration.commission import Commissioned
+from twin.calibration.record_checks import FEWEST
 from twin.cli import recording
 from twin.cli.recording import (
     FEWEST_CYCLES,

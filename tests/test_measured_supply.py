@@ -13,9 +13,10 @@ from second_world.draw import draw_rig
 from second_world.faults import Fault
 from second_world.records import record
 
-from twin.calibration.calibrate import as_gauged, calibrate, limited
+from twin.calibration.calibrate import calibrate, limited
 from twin.calibration.commission import commission
 from twin.calibration.page import calibration_summary
+from twin.calibration.record_checks import as_gauged
 from twin.calibration.report import as_json, in_words
 from twin.calibration.save import record_of
 from twin.config import Config
@@ -149,7 +150,7 @@ def test_a_calibration_says_what_the_gauge_corrected(tmp_path: Path) -> None:
     assert "The supply reads 4.5 bar" in calibration_summary(found, unit.asset, log_of("gripper"))
     log = tmp_path / "log.mcap"
     log.write_bytes(b"a log")
-    contradicts = as_json(found, record_of(found, unit, log))["contradicts"]
+    contradicts = as_json(found, unit.asset, record_of(found, unit, log))["contradicts"]
     assert contradicts == [{"what": remark.text, "line": remark.line}]
 
 

@@ -154,7 +154,7 @@ def fitted_on(monkeypatch: pytest.MonkeyPatch, config: Config, samples: Samples)
     def stop(used: Samples, guesses: list[DataSet], *_: object) -> None:
         raise FitReachedError(used, guesses[0])
 
-    monkeypatch.setattr(module, "_fit", stop)
+    monkeypatch.setattr(module, "market_fit", stop)
     with pytest.raises(FitReachedError) as reached:
         commission(config, [samples], quiet)
     return reached.value

@@ -176,7 +176,7 @@ def test_a_commissioned_unit_has_these_thresholds(monkeypatch: pytest.MonkeyPatc
         nothing = np.zeros(len(free))
         return Fitted(data, free, certain, certain, nothing + 1.0, 0.0, nothing > 0.0)
 
-    monkeypatch.setattr("twin.calibration.commission._fit", fit)
+    monkeypatch.setattr("twin.calibration.commission.market_fit", fit)
     commissioned = commission(replace(typed("gripper"), data=data), [samples], quiet)
     ejector = commissioned.calibration.fitted.data.ejector
     expected = as_commissioned(data, commissioned.samples).ejector

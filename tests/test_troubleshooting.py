@@ -18,7 +18,7 @@ OTHERS = {  # quoted without being a message: of commands, of this page, and of 
     "…",
     "No space left on device",
 }
-REFUSALS = ("commission", "wiring", "stationarity", "calibrate")
+REFUSALS = ("record_checks", "market_fit", "wiring", "stationarity", "calibrate")
 
 
 def rows() -> Iterator[list[str]]:

@@ -7,11 +7,12 @@ from functools import cache
 import numpy as np
 from calibrations import log_of, typed
 
-from twin.calibration.calibrate import Calibration, Remark
+from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
 from twin.calibration.fit import Fitted
 from twin.calibration.parameters import FREE
 from twin.calibration.readings import read
+from twin.calibration.record_checks import Remark
 from twin.calibration.verdict import Residual, Verdict
 from twin.config import Asset
 from twin.monitor.healthy import Healthy

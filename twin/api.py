@@ -71,6 +71,7 @@ from twin.tables.reader import Table, open_table
 from twin.tables.settings import ImportSettings
 
 Place = str | Path
+CORRECT = "correct the configuration, or record healthy cycles"  # after a refused fit
 Progress = Callable[[str], None]
 Source = Recorded | Table
 
@@ -232,8 +233,18 @@ class Calibrated:
 
     @property
     def verdict(self) -> str:
-        """Good, usable, or beyond: off by more than twice what the cycles of the log differ by."""
-        return calibration_report.calibration_word(self._calibration.verdict)
+        """Good, usable, or refused: off by more than twice what the cycles of the log differ by."""
+        return self._calibration.verdict.word
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the record contradicts in the configuration, and the line to write instead."""
+        return [f"{remark.text}: {remark.line}" for remark in self._calibration.remarks]
+
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons to doubt that the unit is healthy, each with what to do."""
+        return [f"{doubt.text}: {doubt.action}" for doubt in self._calibration.doubts]
 
     @property
     def rms_mbar(self) -> float:
@@ -257,9 +268,12 @@ class Calibrated:
     def save(self) -> Record:
         """Store it in the asset database as the unit's data set, like ``twin calibrate``.
 
-        ConfigError if no unit is named.
+        ConfigError if no unit is named, or the fit is refused.
         """
         _require_unit(self.config)
+        if self.verdict == "refused":
+            verdict = calibration_report.calibration_verdict(self._calibration.verdict)
+            raise ConfigError(verdict, CORRECT)
         record, _ = store(self._calibration, self.config, self._log.assets, self._log.path)
         return record
 
@@ -311,7 +325,7 @@ class Commissioned(Calibrated):
         _require_unit(self.config)
         if self.verdict == "refused":
             verdict = calibration_report.headline(self._commissioning.verdict)
-            raise ConfigError(verdict, "correct the configuration, or record healthy cycles")
+            raise ConfigError(verdict, CORRECT)
         record, _ = store_first(self._commissioning, self.config, self._log.assets, self._log.path)
         return record
 

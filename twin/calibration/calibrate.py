@@ -9,12 +9,19 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from twin.calibration.cycles import Cycles
-from twin.calibration.empty_picks import without_empty_picks
+from twin.calibration.doubts import Doubt, healthy_range, measured_doubts
 from twin.calibration.fit import Fitted, fit
-from twin.calibration.parameters import FREE, Space
-from twin.calibration.readings import read
-from twin.calibration.stationarity import check_stationary
-from twin.calibration.verdict import Verdict, judge
+from twin.calibration.market_fit import judged, market_fit
+from twin.calibration.parameters import FREE, FREE_IN_MARKET, Free, Space
+from twin.calibration.record_checks import (
+    FEWEST,
+    Remark,
+    checked,
+    questions,
+    refuse_insufficient,
+)
+from twin.calibration.stationarity import check_one_group, check_stationary
+from twin.calibration.verdict import Verdict
 from twin.config import Config
 from twin.diagnosis.evidence import collect
 from twin.diagnosis.healthy import learned
@@ -25,31 +32,15 @@ from twin.live import Twin
 from twin.model.dataset import DataSet, coefficients
 from twin.monitor.breakpoints import converter_step, rounding_error
 from twin.monitor.cycles import Cycle, figures, whole
-from twin.monitor.detector_window import select_window
 from twin.monitor.healthy import Healthy, Scatter, sure
-from twin.monitor.measured_supply import SUPPLY, is_gauge, supplied
+from twin.monitor.measured_supply import SUPPLY, is_gauge
 from twin.monitor.signal_checks import Contradiction, standing
-from twin.monitor.surroundings import taken_in
-from twin.quality import BREAK, UNUSABLE
-from twin.signals import MBAR, SAMPLE, Command, Phase, Samples, bridged
+from twin.quality import UNUSABLE
+from twin.signals import MBAR, Phase, Samples
 
-FEWEST = 5  # complete cycles
 MOST_FITTED = 12  # cycles that are fitted; the others only show the scatter
-MOST_SPOILT = 0.02  # share of samples that are saturated, stale or bad
-MOST_LEFT = 15.0  # mbar rms: a larger residual means that the log is not of such an ejector
 LEAST_SCATTER = 0.05  # of a figure, in its unit
 NOTHING: Mapping[str, float] = MappingProxyType({})
-# bar: the supply is reported if it differs by more from the configuration; gauges and regulators
-# scatter by half of it.
-SUPPLY_CLEARLY = 0.2
-
-
-@dataclass(frozen=True)
-class Remark:
-    """A contradiction of record and configuration, with the line to change."""
-
-    text: str
-    line: str
 
 
 @dataclass(frozen=True)
@@ -62,7 +53,10 @@ class Calibration:
     cycles: int
     first_ns: int  # host time of the log's first and last row
     last_ns: int
-    remarks: tuple[Remark, ...] = ()  # corrections that the record made; Commissioned has its own
+    # Corrections that the record made, and doubts that it is of a healthy unit; Commissioned has
+    # its own.
+    remarks: tuple[Remark, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 def calibrate(
@@ -70,82 +64,48 @@ def calibrate(
 ) -> Calibration:
     """Calibrate the unit of ``config`` on a log, starting from its data set.
 
-    Raises ConfigError if the log does not suffice or is not that of a healthy unit.
+    It stays near the type if the twin then follows the log. If not, all is fitted that a
+    commissioning fits, beginning from there. Raises ConfigError if the log does not suffice or is
+    not that of a healthy unit. A caller must check the ``verdict`` before storing the result.
     """
     progress("reading the log")
-    samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    samples, by_picks = picked(config.data, samples)
-    gauged, by_gauge = as_gauged(config.data, samples)
-    config = replace(config, data=taken_in(gauged, samples))
+    record = checked(config, blocks)
+    config, samples, readings = record.config, record.samples, record.readings
     before = complete(config.data, samples)
     refuse_insufficient(samples, before, "calibration")
     refuse_contradicting(before, config.data)
     samples = samples[samples["time_ns"] <= before[-1].end_ns]
-    used = samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns
-    fitted = fit(samples[used], Space.of_type(config.data), progress)
-    refuse_rounded(fitted.data, samples)
+    used = samples[samples["time_ns"] <= before[:MOST_FITTED][-1].end_ns]
+    fitted = fit(used, Space.of_type(config.data), progress)
     progress("what healthy cycles scatter")
+    check_unchanged(fitted.data, samples, complete(fitted.data, samples))
+    fitted, found_cycles, verdict = judged(samples, readings.noise, fitted, progress)
+    check_one_group(found_cycles)
+    if verdict.word == "refused":
+        progress("more is left than the cycles differ: fitting all that ejectors differ by")
+        wider = market_fit(used, [fitted.data], FREE_IN_MARKET, progress)
+        wider_verdict = judged(samples, readings.noise, wider, progress)[-1]
+        if wider_verdict.worst < verdict.worst:
+            fitted, verdict = wider, wider_verdict
+    if verdict.word != "refused":
+        check_within_type(fitted, config.data)
     cycles = complete(fitted.data, samples)
-    check_unchanged(fitted.data, samples, cycles)
-    check_within_type(fitted, config.data)
-    progress("judging the fit")
-    verdict = judge(Cycles.found(samples[used], fitted.data), fitted.data, read(samples).noise)
     healthy = like_these(config, fitted, scatter(fitted.data, cycles), samples)
-    times = samples["host_ns"]
-    ends = int(times[0]), int(times[-1])
-    return Calibration(fitted, verdict, healthy, len(cycles), *ends, (*by_picks, *by_gauge))
-
-
-def picked(data: DataSet, samples: Samples) -> tuple[Samples, list[Remark]]:
-    """``samples`` without suctions that met no part, and a remark if there are any."""
-    with_part, empty = without_empty_picks(data, samples)
-    if not empty:
-        return samples, []
-    left_out = (
-        "1 suction met no part and was left out"
-        if empty == 1
-        else f"{empty} suctions met no part and were left out"
+    return Calibration(
+        fitted,
+        verdict,
+        healthy,
+        len(cycles),
+        first_ns=int(samples["host_ns"][0]),
+        last_ns=int(samples["host_ns"][-1]),
+        remarks=(*record.remarks, *questions(readings)),
+        doubts=tuple(measured_doubts(config.data, readings, healthy)),
     )
-    line = '[[data.system.parts]] kind = "vessel", if no part is picked up'
-    return with_part, [Remark(left_out, line)]
-
-
-def as_gauged(data: DataSet, samples: Samples) -> tuple[DataSet, list[Remark]]:
-    """``data`` with the supply pressure that a gauge shows at rest, if there is one."""
-    gauged = supplied(data, samples)
-    measured, configured = gauged.supply.pressure_bar, data.supply.pressure_bar
-    if abs(measured - configured) <= SUPPLY_CLEARLY:
-        return gauged, []
-    text = f"the supply reads {measured:g} bar; the configuration says {configured:g}"
-    return gauged, [Remark(text, f"[data.supply] pressure_bar = {measured:g}")]
 
 
 def complete(data: DataSet, samples: Samples) -> list[Cycle]:
     """Complete cycles with the twin of ``data``, without the first, in which it settles."""
     return [cycle for cycle in whole(Twin.of(data).over([samples])) if cycle.settled]
-
-
-def refuse_insufficient(samples: Samples, cycles: Sequence[Cycle], purpose: str) -> None:
-    """ConfigError if there is not enough for ``purpose``, which the message names."""
-    if not (samples["commands"] & Command.SUCTION).any():
-        raise ConfigError("the log has no suction phase", "check which tag is suction")
-    spoilt = np.isnan(samples["pressure"]) | ((samples["quality"] & UNUSABLE) != 0)
-    if (share := float(np.mean(spoilt))) > MOST_SPOILT:
-        raise ConfigError(
-            f"the pressure is saturated, stale or bad in {share:.1%} of the samples",
-            "check the sensor's range and wiring, then record again",
-        )
-    breaks = int(np.count_nonzero(samples["quality"][1:] & BREAK))
-    if breaks > len(cycles):
-        raise ConfigError(
-            f"the log has {breaks} gaps and {len(cycles)} cycles without one",
-            "record again in block mode",
-        )
-    if len(cycles) < FEWEST:
-        raise ConfigError(
-            f"the log has {len(cycles)} complete cycles that count; {purpose} needs {FEWEST}",
-            "record suction, blow-off and idle again and again without a gap",
-        )
 
 
 def refuse_contradicting(cycles: Sequence[Cycle], data: DataSet) -> None:
@@ -161,36 +121,25 @@ def contradictions(cycles: Sequence[Cycle], data: DataSet) -> list[Contradiction
     return standing(cycles, twin.theta, twin.detector)
 
 
-def refuse_rounded(data: DataSet, samples: Samples) -> None:
-    """ConfigError if a twin of ``data`` would not see the nozzle go off in each cycle."""
-    detector = Twin.of(data).detector
-    if select_window(detector, [samples]) != detector:
-        raise ConfigError(
-            "the air saving's switching is too round in this log to be seen in each cycle: the"
-            f" pressure comes slower than a lag of {data.sensor.lag_ms:.3g} ms explains",
-            "set [data.sensor] lag_ms to that of sensor and PLC input together, or choose a faster"
-            " input filter and record again",
-        )
-
-
 def check_within_type(fitted: Fitted, data: DataSet) -> None:
-    """ConfigError if the fit is no healthy unit of its type."""
-    if fitted.left > MOST_LEFT * MBAR:
+    """ConfigError if the fit is no healthy unit of its type; names the value farthest beyond."""
+    limited_free = [free for free in FREE if free.healthy is not None]
+    free = max(limited_free, key=lambda free: _excess(free, fitted.data, data))
+    if _excess(free, fitted.data, data) > 0.0:
+        value, (low, high) = free.of(fitted.data), healthy_range(free, data)
+        size = f"{value:.3g} {free.unit}".strip()
         raise ConfigError(
-            f"the model cannot follow this log: {fitted.left / MBAR:.0f} mbar rms are left",
-            "check [data.system] against what hangs on the ejector; twin diagnose says more",
+            f"this log is not that of a healthy unit: {free.name} would be {size}, where"
+            f" {low:.3g} to {high:.3g} is healthy for its type",
+            "repair first (twin diagnose names the cause), or set the value in [data] if it is"
+            " as built",
         )
-    for free in FREE:
-        value, expected, sigma = free.of(fitted.data), free.of(data), free.sigma(data)
-        low, high = free.healthy or (np.inf, np.inf)
-        if not -low * sigma <= value - expected <= high * sigma:
-            raise ConfigError(
-                f"this log is not that of a healthy unit: {free.name} would be {value:.3g}"
-                f" {free.unit}, where {max(expected - low * sigma, free.low):.3g} to"
-                f" {expected + high * sigma:.3g} is healthy for its type",
-                "repair first (twin diagnose names the cause), or set the value in [data] if it is"
-                " as built",
-            )
+
+
+def _excess(free: Free, fitted: DataSet, data: DataSet) -> float:
+    """Sigmas by which a value is beyond what is healthy for the type ``data``; below 0 within."""
+    value, (low, high) = free.of(fitted), healthy_range(free, data)
+    return max(value - high, low - value) / free.sigma(data)
 
 
 def check_unchanged(data: DataSet, samples: Samples, cycles: Sequence[Cycle]) -> None:

@@ -11,32 +11,27 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from twin.calibration.calibrate import (
     MOST_FITTED,
     Calibration,
-    Remark,
-    as_gauged,
     complete,
     contradictions,
     like_these,
-    picked,
-    refuse_insufficient,
     scatter,
 )
 from twin.calibration.cycles import Cycles
 from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
-from twin.calibration.fit import Fitted, fit_from_afar
+from twin.calibration.fit import Fitted
+from twin.calibration.market_fit import judged, market_fit
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
 from twin.calibration.readings import Readings, read, rows_by_phase
+from twin.calibration.record_checks import Remark, checked, questions, refuse_insufficient
 from twin.calibration.stationarity import check_one_group
 from twin.calibration.thresholds import decided
-from twin.calibration.verdict import Verdict, judge
-from twin.calibration.wiring import refuse_miswired
+from twin.calibration.verdict import Verdict
 from twin.config import Config
 from twin.diagnosis.text import listed, spoken
-from twin.errors import ConfigError
 from twin.languages.texts import ntr, numeral, tr
 from twin.model import theta as c
 from twin.model.air import GAMMA, R
@@ -47,23 +42,17 @@ from twin.monitor.cycles import FEWEST_ROWS
 from twin.monitor.healthy import UNSEEN_LEVEL_MBAR, Healthy, Scatter
 from twin.monitor.signal_checks import APART, Contradiction
 from twin.monitor.statistics import LEVELS
-from twin.monitor.surroundings import taken_in
 from twin.signals import (
     MBAR,
     ML,
     MS,
-    SAMPLE,
     SL_MIN,
     ZERO_C,
-    Command,
     Reported,
     Samples,
-    bridged,
 )
 
-SLOWEST = 10.5 * MS  # s between rows; switching within a few rows would not be seen
 COARSE = 2.05 * MS  # s between rows, above which the answer states what they cannot show
-MOST_MISSING = 0.2  # share of rows
 ROOM_TEMPERATURE = 293.15  # K, for a first guess
 # Where fits start: the sensor's place along the line, and the share of all gas that is in the port.
 PLACES, PORT_SHARES = (0.05, 0.95), (0.01, 0.1)
@@ -90,7 +79,6 @@ FAR_WEAKER = 0.5  # of the guess of a blow-off, below which a fit does not reach
 PUSHED_OFF = 0.8  # of the highest pressure above ambient: there blow-off pushes a part off
 DRAINS = 0.2  # rate at which blow-off drains its reservoir, over the rate at which it fills
 COMES = 40.0  # ms after suction at which cups meet a part, if the record does not show it
-LITTLE_VACUUM = 200.0  # mbar; flow ejectors on leaking parts make more
 AMBIENT_CLEARLY = 3.0  # mbar: ambient pressure is reported if it differs by more
 # Relative difference from the configured volume above which that of the flow meter is used: nearly
 # twice a flow meter's error on rigs whose truth is known.
@@ -169,14 +157,11 @@ def commission(
     well the twin follows the record; a caller must check it before storing the result.
     """
     progress("reading the record")
-    samples, by_picks = _with_parts(config.data, blocks)
-    readings = read(samples)
-    refuse_unreadable(readings)
+    record = checked(config, blocks)
+    samples, readings = record.samples, record.readings
     optimum_is_told = "optimum_bar" in config.data.supply.model_fields_set
     hysteresis_is_told = "h1_hysteresis_mbar" in config.data.ejector.model_fields_set
-    gauged, by_gauge = as_gauged(config.data, samples)
-    config = replace(config, data=taken_in(gauged, samples))
-    refuse_miswired(samples, readings, config.data.ambient.pressure_mbar * MBAR)
+    config = record.config
     guess, _ = guessed(config.data, readings)
     before = complete(guess, samples)
     refuse_insufficient(samples, before, "commissioning")
@@ -214,7 +199,7 @@ def commission(
         samples,
         readings.noise,
         guesses,
-        lambda starting: _fit(used, starting, free, progress),
+        lambda starting: market_fit(used, starting, free, progress),
         progress,
     )
     readings = as_switched(readings, found_cycles)
@@ -226,11 +211,11 @@ def commission(
         config.data,
         fitted,
         verdict,
-        lambda start: _judged(
-            samples, readings.noise, _fit(used, [start], known, progress), progress
+        lambda start: judged(
+            samples, readings.noise, market_fit(used, [start], known, progress), progress
         )[-1],
     )
-    remarks = [*by_picks, *by_gauge, *by_flow, *remarks, *of_fit]
+    remarks = [*record.remarks, *by_flow, *remarks, *of_fit]
     cycles = complete(fitted.data, samples)
     sigma = 0.0 if optimum_is_told else OPTIMUM_UNTOLD * fitted.data.supply.optimum_bar
     unseen_level = _unseen_level(readings, is_told=hysteresis_is_told)
@@ -314,51 +299,6 @@ def unreported(samples: Samples) -> Samples:
     return samples
 
 
-def _with_parts(data: DataSet, blocks: Iterable[Samples]) -> tuple[Samples, list[Remark]]:
-    """The record without suctions that met no part, and a remark if there are any."""
-    samples = np.concatenate([np.empty(0, SAMPLE), *bridged(blocks)])
-    refuse_empty(samples)
-    return picked(data, samples)
-
-
-def refuse_empty(samples: Samples) -> None:
-    """ConfigError if there is no suction."""
-    if not (samples["commands"] == Command.SUCTION).any():
-        raise ConfigError("the record has no suction", "check which tag or column is suction")
-
-
-def refuse_unreadable(readings: Readings) -> None:
-    """ConfigError if rows are too far apart, or too many are missing."""
-    if readings.period > SLOWEST:
-        raise ConfigError(
-            f"the record has a row each {readings.period / MS:.0f} ms: the nozzle's switching and"
-            " the valves' delays are not seen in it",
-            f"record again with a row each {SLOWEST / MS:.0f} ms or faster; what needs no twin:"
-            " twin figures show LOG, twin compare A B",
-        )
-    if readings.missing > MOST_MISSING:
-        raise ConfigError(
-            f"{readings.missing:.0%} of the record's rows are missing",
-            'record again in block mode (mode = "block"), which loses none',
-        )
-
-
-def _fit(
-    samples: Samples,
-    guesses: Sequence[DataSet],
-    free: tuple[Free, ...],
-    progress: Callable[[str], None],
-) -> Fitted:
-    try:
-        return fit_from_afar(samples, guesses, progress, free)
-    except (ValidationError, np.linalg.LinAlgError) as error:
-        raise ConfigError(
-            "the fit ends at values that no ejector has: this is no record of the parts that"
-            " [data.system] lists, or of more than one unit",
-            "check volumes, tubes and the sensor's place; commission on a record of one unit",
-        ) from error
-
-
 def _best(
     samples: Samples,
     noise: float,
@@ -370,21 +310,12 @@ def _best(
 
     If that is not good, it is the better one of this and of another from other tubes.
     """
-    best = _judged(samples, noise, fits(guesses), progress)
+    best = judged(samples, noise, fits(guesses), progress)
     if best[-1].word == "good":
         return best
     progress("more is left than the cycles differ: trying wider and narrower tubes")
-    other = _judged(samples, noise, fits(other_tubes(guesses, best[0].data)), progress)
+    other = judged(samples, noise, fits(other_tubes(guesses, best[0].data)), progress)
     return min(best, other, key=lambda result: result[-1].worst)
-
-
-def _judged(
-    samples: Samples, noise: float, fitted: Fitted, progress: Callable[[str], None]
-) -> tuple[Fitted, Cycles, Verdict]:
-    """A fit, the cycles as it sees them, and how well it follows them."""
-    progress("judging the fit")
-    cycles = Cycles.found(samples, fitted.data)
-    return fitted, cycles, judge(cycles, fitted.data, noise)
 
 
 def other_tubes(guesses: Sequence[DataSet], best: DataSet) -> list[DataSet]:
@@ -496,7 +427,7 @@ def guessed(data: DataSet, readings: Readings) -> tuple[DataSet, list[Remark]]:
     tables = data.model_dump()
     ambient, remarks = _ambient(tables, readings)
     tables["sensor"]["noise_mbar"] = max(readings.noise / MBAR, 0.05)
-    remarks += [*_air_saving(tables["ejector"], readings, ambient), *_questions(readings)]
+    remarks += [*_air_saving(tables["ejector"], readings, ambient), *questions(readings)]
     tables["system"].update(free_convection=0.5, forced_convection=1.0, leak_critical_ratio=0.4)
     tables["system"]["creep_share"] = CREEPS
     tables["supply"].update(SAGS)
@@ -539,16 +470,6 @@ def _air_saving(ejector: dict[str, Any], readings: Readings, ambient: float) -> 
         text = "in no suction the nozzle goes off by itself; the configuration has air saving on"
         remarks.append(Remark(text, '[data.ejector] air_saving = "off"'))
     return [*remarks, *_part_present(ejector, readings, ambient)]
-
-
-def _questions(readings: Readings) -> Iterator[Remark]:
-    """Remarks on what is unusual in the record, but possible."""
-    if not readings.tells_blow_off:
-        text = "no row of the record has blow-off; where the unit has one, its command is missing"
-        yield Remark(text, "[driver.tags.blow_off], or the column blow_off")
-    if (highest := (readings.highest - readings.deepest) / MBAR) < LITTLE_VACUUM:
-        text = f"the vacuum is {highest:.0f} mbar at most, where ejectors make 300 and more"
-        yield Remark(text, "[driver.tags.pressure] unit, if it is in kPa, mmHg or psi")
 
 
 def _flows(ejector: dict[str, Any], readings: Readings, evacuated: float, ambient: float) -> None:

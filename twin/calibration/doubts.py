@@ -62,7 +62,7 @@ def doubts_of_type(config: Config, fitted: Fitted) -> Iterator[Doubt]:
     for free in FREE:
         if free.name not in OF_TYPE or not fitted.determined[names.index(free.name)]:
             continue
-        low, high = _healthy(free, config.data)
+        low, high = healthy_range(free, config.data)
         surely_low, surely_high = fitted.interval(free.name)
         if surely_low > high or surely_high < low:
             yield Doubt(
@@ -72,7 +72,7 @@ def doubts_of_type(config: Config, fitted: Fitted) -> Iterator[Doubt]:
             )
 
 
-def _healthy(free: Free, typed: DataSet) -> tuple[float, float]:
+def healthy_range(free: Free, typed: DataSet) -> tuple[float, float]:
     """Least and greatest value of a healthy unit of the type ``typed``."""
     expected, sigma = free.of(typed), free.sigma(typed)
     below, above = free.healthy or (float("inf"), float("inf"))

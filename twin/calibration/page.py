@@ -4,10 +4,12 @@ import html
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from twin.calibration.calibrate import Calibration, Remark
+from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
+from twin.calibration.doubts import Doubt
 from twin.calibration.picture import draw_fit
 from twin.calibration.read_off import read_off
+from twin.calibration.record_checks import Remark
 from twin.calibration.report import (
     calibration_headline,
     calibration_verdict,
@@ -42,8 +44,8 @@ def calibration_summary(calibration: Calibration, asset: Asset, samples: Samples
     title = f"{asset.type} {asset.id}: {calibration_headline(calibration)}"
     picture = draw_fit(calibration.fitted.data, samples)
     verdict = page.paragraph(f"{capital(calibration_verdict(calibration.verdict))}.")
-    corrections = _corrections(calibration.remarks)
-    parts = [verdict, *corrections, _residuals(calibration.verdict), _parameters(calibration)]
+    boxes = (*_doubts(calibration.doubts), *_corrections(calibration.remarks))
+    parts = [verdict, *boxes, _residuals(calibration.verdict), _parameters(calibration)]
     return page.summary(title, parts, picture)
 
 
@@ -93,9 +95,7 @@ def framed(asset: Asset, word: str, headline: str, body: str, footer: str) -> st
 
 
 def _remarks(commissioned: Commissioned) -> Iterator[str]:
-    for doubt in commissioned.doubts:
-        what = tr("Is the unit healthy? {what}", what=capital(retold(doubt.text)))
-        yield page.box(what, f"{capital(retold(doubt.action))}.")
+    yield from _doubts(commissioned.doubts)
     yield from _corrections(commissioned.remarks)
     for contradiction in commissioned.contradictions:
         action = capital(retold(contradiction.action))
@@ -108,6 +108,12 @@ def _remarks(commissioned: Commissioned) -> Iterator[str]:
         )
     if commissioned.unseen:
         yield page.paragraph(f"{capital(commissioned.unseen)}.")
+
+
+def _doubts(doubts: Sequence[Doubt]) -> Iterator[str]:
+    for doubt in doubts:
+        what = tr("Is the unit healthy? {what}", what=capital(retold(doubt.text)))
+        yield page.box(what, f"{capital(retold(doubt.action))}.")
 
 
 def _corrections(remarks: Sequence[Remark]) -> Iterator[str]:

@@ -95,7 +95,8 @@ FREE = (
     Free("system", "line_share", "", 0.2, 0.05, 0.95, market=0.25, scaled=False),
     Free("system", "sensor_shift", "", 0.2, -1.0, 1.0, market=0.4, scaled=False),
     Free("system", "leak_sl_min", "sl/min", 1.0, 0.0, 60.0, healthy=(1.0, 0.6), market=1.5),
-    Free("sensor", "lag_ms", "ms", 1.0, 0.5, 200.0, market=0.4),
+    # Farther off is another filter in front of the sensor, which a wide fit would hide elsewhere.
+    Free("sensor", "lag_ms", "ms", 1.0, 0.5, 200.0, healthy=_ANY, market=0.4),
 )
 _NUMBER = {free.key: number for number, free in enumerate(FREE)}
 _BENDS = [_NUMBER[key] for key in ("bulge", "skew", "bend_2", "bend_3")]

@@ -4,9 +4,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from twin.assets.record import Record
-from twin.calibration.calibrate import Calibration, Remark
+from twin.calibration.calibrate import Calibration
 from twin.calibration.commission import Commissioned
+from twin.calibration.doubts import Doubt
 from twin.calibration.read_off import read_off
+from twin.calibration.record_checks import Remark
 from twin.calibration.verdict import WEAKENS, Residual, Verdict
 from twin.config import Asset
 from twin.diagnosis.text import spoken
@@ -14,8 +16,7 @@ from twin.errors import TwinError
 from twin.languages.texts import numeral, tr
 from twin.signals import MBAR, MS, Phase
 
-# A calibration that is off by more than twice its floor. It is stored all the same.
-BEYOND = "beyond"
+CALIBRATION, COMMISSIONING = "ejector-twin-calibration/1", "ejector-twin-commissioning/1"
 
 
 def in_words(calibration: Calibration) -> str:
@@ -23,6 +24,7 @@ def in_words(calibration: Calibration) -> str:
     lines = [
         calibration_headline(calibration),
         calibration_verdict(calibration.verdict),
+        *_doubts(calibration.doubts),
         *_corrections(calibration.remarks),
         "",
         *_residuals(calibration.verdict),
@@ -30,6 +32,12 @@ def in_words(calibration: Calibration) -> str:
         _values(calibration),
     ]
     return "\n".join(lines)
+
+
+def _doubts(doubts: Sequence[Doubt]) -> Iterator[str]:
+    """Why the record may not be of a healthy unit, each with what to do."""
+    for doubt in doubts:
+        yield from ("", f"is the unit healthy? {doubt.text}", f"  {doubt.action}")
 
 
 def _corrections(remarks: Sequence[Remark]) -> Iterator[str]:
@@ -71,18 +79,29 @@ def calibration_headline(calibration: Calibration) -> str:
     return f"{calibration.cycles} healthy cycles; the model is {left:.2f} mbar rms off"
 
 
-def calibration_word(verdict: Verdict) -> str:
-    """The verdict on a calibration in a word: ``good``, ``usable`` or ``beyond``."""
-    return BEYOND if verdict.word == "refused" else verdict.word
-
-
 def calibration_verdict(verdict: Verdict) -> str:
-    """The verdict on a calibration, which refuses none for it, and what it rests on."""
-    if calibration_word(verdict) != BEYOND:
-        return headline(verdict)
-    word = tr("beyond twice its floor")
-    advice = tr("Commission the unit instead: twin commission fits more of it")
-    return f"{word}: {_beyond(verdict)}. {advice}"
+    """The verdict on a calibration in a word, and what it rests on."""
+    return f"{tr(verdict.word)}: {'. '.join(calibration_sentences(verdict))}"
+
+
+def calibration_sentences(verdict: Verdict) -> list[str]:
+    """What the verdict on a calibration rests on, and what follows; none ends in a full stop."""
+    if verdict.word != "refused":
+        return sentences(verdict)
+    return [
+        _beyond(verdict),
+        tr("Nothing is stored: causes would be named wrongly"),
+        tr(
+            "Commands, unit and sign look right. What is left may be a part, a volume or a filter"
+            " of the sensor that [data] describes otherwise, something that the model does not"
+            " have, or a fault of the unit"
+        ),
+        tr(
+            "twin commission tries more: other places of the sensor, other tubes, and parts that"
+            " leave in another way"
+        ),
+        tr("What needs no twin: twin figures, twin compare"),
+    ]
 
 
 def _scatter(calibration: Calibration) -> list[str]:
@@ -95,21 +114,28 @@ def _scatter(calibration: Calibration) -> list[str]:
     ]
 
 
-def as_json(calibration: Calibration, record: Record) -> dict[str, Any]:
-    """The calibration for programs, with the stored data set."""
+def as_json(calibration: Calibration, asset: Asset, record: Record | None) -> dict[str, Any]:
+    """The calibration for programs; ``data`` is included even if it is refused."""
     return {
-        "format": "ejector-twin-calibration/1",
-        "asset": {"type": record.type, "id": record.name},
-        "record": record.id,
+        "format": CALIBRATION,
+        "asset": {"type": asset.type, "id": asset.id},
+        "record": record.id if record else None,
         "cycles": calibration.cycles,
         "left_mbar": calibration.fitted.left / MBAR,
-        "verdict": calibration_word(calibration.verdict),
+        "verdict": calibration.verdict.word,
+        **_refused_because(calibration.verdict),
         "residual": residuals_as_json(calibration.verdict),
         "contradicts": _contradicts(calibration.remarks),
+        "doubts": _doubts_as_json(calibration.doubts),
         "parameters": parameters(calibration),
-        "healthy": dict(record.healthy),
-        "data": dict(record.data),
+        "healthy": calibration.healthy.model_dump(mode="json"),
+        "data": calibration.fitted.data.model_dump(),
     }
+
+
+def _doubts_as_json(doubts: Sequence[Doubt]) -> list[dict[str, str]]:
+    """For programs, why the record may not be of a healthy unit."""
+    return [{"what": doubt.text, "do": doubt.action} for doubt in doubts]
 
 
 def _contradicts(remarks: Sequence[Remark]) -> list[dict[str, str]]:
@@ -153,8 +179,7 @@ def commissioned_in_words(commissioned: Commissioned) -> str:
     lines += _residuals(commissioned.verdict)
     if commissioned.verdict.word == "refused":
         lines += ["", to_check()]
-    for doubt in commissioned.doubts:
-        lines += ["", f"is the unit healthy? {doubt.text}", f"  {doubt.action}"]
+    lines += _doubts(commissioned.doubts)
     lines += _corrections(commissioned.remarks)
     for contradiction in commissioned.contradictions:
         lines += [
@@ -242,14 +267,14 @@ def commissioned_as_json(
     """The commissioning for programs; ``data`` is included even if it is refused."""
     fitted = commissioned.calibration.fitted
     return {
-        "format": "ejector-twin-commissioning/1",
+        "format": COMMISSIONING,
         "asset": {"type": asset.type, "id": asset.id},
         "record": record.id if record else None,
         "verdict": commissioned.verdict.word,
         **_refused_because(commissioned.verdict),
         "residual": residuals_as_json(commissioned.verdict),
         "contradicts": _contradicts(commissioned.remarks),
-        "doubts": [{"what": doubt.text, "do": doubt.action} for doubt in commissioned.doubts],
+        "doubts": _doubts_as_json(commissioned.doubts),
         "signals": [
             {"signal": contradiction.signal, "what": contradiction.what, "do": contradiction.action}
             for contradiction in commissioned.contradictions
@@ -273,10 +298,12 @@ def _refused_because(verdict: Verdict) -> dict[str, str]:
     return {"reason": sentences(verdict)[0], "do": to_check()}
 
 
-def refusal_as_json(error: TwinError, asset: Asset) -> dict[str, Any]:
-    """The refusal for programs; it has the same first keys as a commissioning."""
+def refusal_as_json(
+    error: TwinError, asset: Asset, answer_format: str = COMMISSIONING
+) -> dict[str, Any]:
+    """The refusal for programs; it has the same first keys as an answer of ``answer_format``."""
     return {
-        "format": "ejector-twin-commissioning/1",
+        "format": answer_format,
         "asset": {"type": asset.type, "id": asset.id},
         "record": None,
         "verdict": "refused",

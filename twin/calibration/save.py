@@ -19,7 +19,10 @@ OF_TYPE = ("supply", "ejector")  # tables of a data set that belong to the type
 
 
 def store(calibration: Calibration, config: Config, assets: str, log: Path) -> tuple[Record, str]:
-    """Add the unit's data set to the database; give the record and the database's name."""
+    """Add the unit's data set to the database; give the record and the database's name.
+
+    The provenance has the verdict, and times the floor for each weak phase.
+    """
     with open_chosen(assets, config.document, write=True) as database:
         return add(database, record_of(calibration, config, log)), database.name
 
@@ -29,7 +32,7 @@ def store_first(
 ) -> tuple[Record, str]:
     """Store the data set of a unit; add its type with the unit's values if that is unknown.
 
-    The unit's provenance has the verdict, and times the floor for each weak phase.
+    Both have the verdict in their provenance, as ``store`` does.
     """
     with open_chosen(assets, config.document, write=True) as database:
         unit = record_of(commissioned.calibration, config, log)
@@ -41,8 +44,7 @@ def store_first(
                 "type", unit.type, unit.type, type_data, provenance=type_provenance
             )
             database.add(type_record)
-        judged = {**unit.provenance, **_judged(commissioned.verdict)}
-        return add(database, replace(unit, provenance=judged)), database.name
+        return add(database, unit), database.name
 
 
 def _judged(verdict: Verdict) -> dict[str, Any]:
@@ -77,6 +79,7 @@ def record_of(calibration: Calibration, config: Config, log: Path) -> Record:
                 if is_determined
             ],
             "left_mbar": round(fitted.left / MBAR, 3),
+            **_judged(calibration.verdict),
         },
         valid_from_ns=provenance.valid_from(calibration.first_ns),
     )

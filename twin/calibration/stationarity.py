@@ -58,10 +58,10 @@ def check_stationary(
     steps = sorted((step for step in steps if step.significant), key=lambda step: -step.gain)
     if steps:
         best = steps[0]
-        size = abs(best.size) * best.parameter.typical
+        size = f"{abs(best.size) * best.parameter.typical:.2g} {best.parameter.unit}".strip()
         raise ConfigError(
             f"the cycles are not alike: with cycle {best.first + 1} something changes that looks"
-            f" like {best.effect}, by {size:.2g} {best.parameter.unit}",
+            f" like {best.effect}, by {size}",
             "record healthy cycles of one state; twin diagnose says more",
         )
 
@@ -88,7 +88,7 @@ def check_one_group(cycles: Cycles) -> None:
                 f"from cycle {first + 2} on the record is another, by {np.sqrt(step) / MBAR:.1f}"
                 f" mbar rms, and other cycles differ by {usual:.1f}: it is of two units, or"
                 " something was changed during it",
-                "commission on a record of one healthy unit in one state",
+                "use a record of one healthy unit in one state",
             )
 
 

@@ -76,7 +76,7 @@ def _refuse_two_units(samples: Samples) -> None:
             raise ConfigError(
                 f"the pressure moves by {middle[0]} mbar in each cycle, and by {middle[1]} mbar"
                 f" from cycle {first + 1} on: its unit of measurement changes within the record",
-                f"give both parts the same unit, or commission on one part; check {TAG}",
+                f"give both parts the same unit, or use one part alone; check {TAG}",
             )
 
 

@@ -19,9 +19,12 @@ def calibrate(
     assets: AssetsUrl = "",
     json_file: JsonAlone = None,
 ) -> None:
-    """Fit the instance-specific data set of one unit to healthy cycles, and store it."""
+    """Fit the instance-specific data set of one unit to healthy cycles, and store it.
+
+    The verdict is good, usable or refused (exit code 2). What is refused is not stored.
+    """
     from twin.calibration.calibrate import calibrate as fit_unit
-    from twin.calibration.report import as_json, in_words
+    from twin.calibration.report import CALIBRATION, as_json, in_words, refusal_as_json
     from twin.calibration.save import store
     from twin.config import Config
     from twin.log.reader import open_log
@@ -32,14 +35,23 @@ def calibrate(
     if not settings.asset.id:
         raise ConfigError("no unit is named", "give --id ID, or [asset] id in the configuration")
     recorded = open_log(log)
-    recorded.header.require_commands(str(log))
     settings = settings.of_rows(recorded.header)
     say_if_cut(recorded, log, "used")
-    with status() as say:
-        calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
-    say_if_new(assets, settings.document)
-    record, location = store(calibration, settings, assets, log)
+    try:
+        recorded.header.require_commands(str(log))
+        with status() as say:
+            calibration = fit_unit(settings, (rows for rows, _ in recorded.blocks()), say)
+    except ConfigError as error:
+        if json_file is not None:
+            write_json(json_file, refusal_as_json(error, settings.asset, CALIBRATION))
+        raise
     print(in_words(calibration))
-    print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
+    record = None
+    if calibration.verdict.word != "refused":
+        say_if_new(assets, settings.document)
+        record, location = store(calibration, settings, assets, log)
+        print(f"stored as {settings.asset.id} in {location}, record {record.id[:8]}")
     if json_file is not None:
-        write_json(json_file, as_json(calibration, record))
+        write_json(json_file, as_json(calibration, settings.asset, record))
+    if record is None:
+        raise typer.Exit(2)

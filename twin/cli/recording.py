@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from twin.config import Config
     from twin.signals import Samples
 
-FEWEST_CYCLES = 5  # that a commissioning needs (twin.calibration.calibrate.FEWEST)
+FEWEST_CYCLES = 5  # that a commissioning needs (twin.calibration.record_checks.FEWEST)
 PATIENCE_S = 60.0  # without suction, after which the tag is worth a look. Chosen
 LONGEST_SUCTION_S = 300.0  # likewise for one that does not end; cycles may take minutes. Chosen
 SILENCE_S = 10.0  # without a row: a driver connects again within 2 s if the PLC answers. Chosen

@@ -149,7 +149,7 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     'record again in block mode (mode = "block"), which loses none',
     "the fit ends at values that no ejector has: this is no record of the parts that [data.system]"
     " lists, or of more than one unit",
-    "check volumes, tubes and the sensor's place; commission on a record of one unit",
+    "check volumes, tubes and the sensor's place; use a record of one unit",
     "the pressure falls to {deepest} mbar absolute, and none is below zero: it is gauge pressure,"
     " taken for absolute",
     'set reference = "gauge" of [driver.tags.pressure], or of the column',
@@ -165,8 +165,8 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     'set reference = "absolute" of [driver.tags.pressure], or of the column',
     "the pressure moves by {before} mbar in each cycle, and by {after} mbar from cycle {cycle} on:"
     " its unit of measurement changes within the record",
-    "give both parts the same unit, or commission on one part; check [driver.tags.pressure], or of"
-    " the column",
+    "give both parts the same unit, or use one part alone; check [driver.tags.pressure], or of the"
+    " column",
     "the pressure moves by {size} mbar only in the whole record: no vacuum is made",
     "check the unit and the range of [driver.tags.pressure], or of the column",
     "the pressure rises from about zero to {highest} mbar under suction: it is vacuum, taken for"
@@ -183,12 +183,19 @@ _REFUSALS = (  # why a record cannot be commissioned, and what to do
     "connect [driver.tags.blow_off], or the column blow_off, and record again",
     "from cycle {cycle} on the record is another, by {step} mbar rms, and other cycles differ by"
     " {usual}: it is of two units, or something was changed during it",
-    "commission on a record of one healthy unit in one state",
+    "use a record of one healthy unit in one state",
+    "the cycles are not alike: with cycle {cycle} something changes that looks like {name}, by"
+    " {size}",
+    "record healthy cycles of one state; twin diagnose says more",
+    "this log is not that of a healthy unit: {key} would be {value}, where {low} to {high} is"
+    " healthy for its type",
+    "repair first (twin diagnose names the cause), or set the value in [data] if it is as built",
     "the pressure is saturated, stale or bad in {share}% of the samples",
     "check the sensor's range and wiring, then record again",
     "the log has {breaks} gaps and {cycles} cycles without one",
     "record again in block mode",
     "the log has {cycles} complete cycles that count; commissioning needs {least}",
+    "the log has {cycles} complete cycles that count; calibration needs {least}",
     "record suction, blow-off and idle again and again without a gap",
 )
 _FLEETS = (  # why a unit of a fleet could not be judged
@@ -197,7 +204,7 @@ _FLEETS = (  # why a unit of a fleet could not be judged
     "{count} units to compare, {needed} are needed; its newest log is not diagnosed yet",
     "no diagnosis: {reason}",
 )
-_AS_WRITTEN = {"tag", "command", "log"}  # values that a person types
+_AS_WRITTEN = {"tag", "command", "log", "key"}  # values that a person types
 _SIZE = re.compile(r"([a-z][a-z0-9 ]*?) ([-+]?\d\S* \S+)")  # a name with its size
 
 

@@ -18,7 +18,7 @@ from twin.calibration.save import record_of
 from twin.config import Config
 from twin.diagnosis.answer import diagnose as find_cause
 from twin.diagnosis.evidence import CORES
-from twin.errors import TwinError
+from twin.errors import ConfigError, TwinError
 from twin.fleet.watch import watched
 from twin.log.reader import open_log
 from twin.signals import Samples
@@ -68,8 +68,10 @@ def run(job: Job) -> Done:
 
 def _calibrate(job: Job) -> tuple[dict[str, Any], Record | None]:
     calibration = fit_unit(job.config, _samples(job), _no_progress)
+    if calibration.verdict.word == "refused":
+        raise ConfigError(calibration_report.calibration_verdict(calibration.verdict))
     record = record_of(calibration, job.config, job.log)
-    return calibration_report.as_json(calibration, record), record
+    return calibration_report.as_json(calibration, job.config.asset, record), record
 
 
 def _diagnose(job: Job) -> tuple[dict[str, Any], Record | None]:
