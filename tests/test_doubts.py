@@ -12,8 +12,8 @@ from written_pages import UNIT, commissioned, visible
 from twin.calibration import commission as module
 from twin.calibration.commission import Commissioned, commission
 from twin.calibration.cycles import Cycles
-from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
-from twin.calibration.fit import Fitted
+from twin.calibration.doubts import Doubt, doubts_of_fit, doubts_of_type, measured_doubts
+from twin.calibration.fit import BEST_END, Fitted
 from twin.calibration.page import write_page
 from twin.calibration.readings import read
 from twin.calibration.report import commissioned_as_json, commissioned_in_words
@@ -67,8 +67,27 @@ def fitted_with(determined: bool = True, **ejector: float) -> Fitted:
         update={"ejector": fitted.data.ejector.model_copy(update=ejector)}
     )
     sigma = 0.01 * fitted.prior if determined else fitted.prior
-    covariance = np.diag(sigma**2)
-    return replace(fitted, data=data, covariance=covariance, factor=np.linalg.cholesky(covariance))
+    return replace(fitted, data=data, covariance=np.diag(sigma**2), factor=np.diag(sigma))
+
+
+def test_a_leak_that_the_record_does_not_tell_from_suction_is_told() -> None:
+    fitted = fitted_with()
+    assert list(doubts_of_fit(fitted)) == []
+    data = fitted.data
+    leaky = data.model_copy(
+        update={
+            "ejector": data.ejector.model_copy(update={"end_pressure_mbar": 101.4}),
+            "system": data.system.model_copy(update={"leak_sl_min": 4.16}),
+        }
+    )
+    fitted = replace(fitted, leaky=leaky)
+    (found,) = doubts_of_fit(fitted)
+    assert "may leak 4.2 sl/min: with an end pressure of 101 mbar" in found.text
+    determined = dict(zip([free.name for free in fitted.free], fitted.determined, strict=True))
+    assert not determined["system.leak_sl_min"]
+    assert determined["ejector.response_ms"]
+    assert fitted.interval("system.leak_sl_min")[1] == 4.16
+    assert fitted.interval("ejector.end_pressure_mbar")[0] == BEST_END / MBAR
 
 
 def test_a_value_far_from_its_type_is_told() -> None:

@@ -12,7 +12,7 @@ from twin.calibration.cycles import Cycles
 from twin.calibration.doubts import Doubt, healthy_range, measured_doubts
 from twin.calibration.fit import Fitted, fit
 from twin.calibration.market_fit import judged, market_fit
-from twin.calibration.parameters import FREE, FREE_IN_MARKET, Free, Space
+from twin.calibration.parameters import FREE, FREE_IN_MARKET, Free, Space, values
 from twin.calibration.record_checks import (
     FEWEST,
     Remark,
@@ -186,6 +186,15 @@ def uncertain(fitted: Fitted, untold: Mapping[str, float]) -> dict[str, tuple[fl
     }
 
 
+def _leaky(fitted: Fitted) -> dict[str, float]:
+    """Changes of values to a larger leak with more suction, if that fits as well."""
+    if fitted.leaky is None:
+        return {}
+    changes = values(fitted.leaky, fitted.free) - values(fitted.data, fitted.free)
+    names = [free.name for free in fitted.free]
+    return {name: float(f"{change:.4g}") for name, change in zip(names, changes, strict=True)}
+
+
 def like_these(
     config: Config,
     fitted: Fitted,
@@ -197,6 +206,7 @@ def like_these(
     model_scatter = Healthy(
         figures=figures,
         uncertain=uncertain(fitted, untold),
+        leaky=_leaky(fitted),
         rounding_mbar=rounding(fitted.data, samples),
     )
     monitor = config.monitor.model_copy(update={"healthy": model_scatter})

@@ -21,7 +21,7 @@ from twin.calibration.calibrate import (
     scatter,
 )
 from twin.calibration.cycles import Cycles
-from twin.calibration.doubts import Doubt, doubts_of_type, measured_doubts
+from twin.calibration.doubts import Doubt, doubts_of_fit, doubts_of_type, measured_doubts
 from twin.calibration.fit import Fitted
 from twin.calibration.market_fit import judged, market_fit
 from twin.calibration.parameters import AMBIENT, AMBIENT_TOLD, FREE_IN_MARKET, Free
@@ -240,8 +240,10 @@ def _doubts(config: Config, calibration: Calibration, readings: Readings) -> tup
     """Doubts that the record is of a healthy unit; the values of a bad fit are none."""
     fitted = calibration.fitted
     configured = within(config.data, fitted.data.ambient)
-    of_type = () if calibration.verdict.word == "refused" else doubts_of_type(config, fitted)
-    return *measured_doubts(configured, readings, calibration.healthy), *of_type
+    measured = measured_doubts(configured, readings, calibration.healthy)
+    if calibration.verdict.word == "refused":
+        return tuple(measured)
+    return *measured, *doubts_of_fit(fitted), *doubts_of_type(config, fitted)
 
 
 def _healthy(

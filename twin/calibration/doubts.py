@@ -54,6 +54,18 @@ def measured_doubts(configured: DataSet, readings: Readings, healthy: Healthy) -
         )
 
 
+def doubts_of_fit(fitted: Fitted) -> Iterator[Doubt]:
+    """A doubt if the record does not tell a leak from an ejector that sucks less."""
+    if fitted.leaky is not None:
+        ejector = fitted.leaky.ejector
+        yield Doubt(
+            "what counts as healthy from now on may leak"
+            f" {fitted.leaky.system.leak_sl_min:.2g} sl/min: with an end pressure of"
+            f" {ejector.end_pressure_mbar:.0f} mbar the record fits as well",
+            "leave half a second with both off after suction and record again, if a leak matters",
+        )
+
+
 def doubts_of_type(config: Config, fitted: Fitted) -> Iterator[Doubt]:
     """Doubts by what is healthy for a known type: values surely beyond, by their 95 % interval."""
     if config.origin == HAND_WRITTEN:

@@ -17,11 +17,12 @@ from scipy.optimize import least_squares
 
 from twin.calibration.cycles import Both, Cycles
 from twin.calibration.line_discrepancy import with_left_out
-from twin.calibration.parameters import FREE_IN_MARKET, Free, Space
+from twin.calibration.parameters import FREE_IN_MARKET, Free, Space, values
 from twin.calibration.readings import noise_of
 from twin.calibration.residual_covariance import CycleWhitener, plain, weighted
 from twin.inference.levels import SIGMAS_95
 from twin.inference.sensitivities import derivatives, inside, sensitivities
+from twin.model.air import orifice
 from twin.model.dataset import RIPPLE, DataSet, coefficients, sensor_place
 from twin.model.parts import Tube
 from twin.monitor.uncertain_data import both_sides
@@ -41,6 +42,10 @@ RISING = 40  # steps over the characteristic in which a rise is penalised
 END_PRESSURE = "ejector.end_pressure_mbar"
 NEARLY_NOTHING = 0.02  # of the suction capacity: a record with less flow reaches the end pressure
 BEST_END = 50.0 * MBAR  # Pa, absolute; single-stage ejectors end at 70 and more
+# Share of the end pressure that an ejector may have instead, if it is above GOOD_END (Pa,
+# absolute), which a good single-stage ejector reaches. Chosen: one sigma of the market.
+BETTER, GOOD_END = 0.6, 100.0 * MBAR
+LEAST_MORE = 0.03  # of the suction capacity: a leak that is larger by less changes no answer
 DEEPEST = 0.001  # quantile of a record's pressures that counts as its deepest
 SPEED_OF_SOUND = 343.0  # m/s
 # s, travel time in a line at which waves are late by as much. Chosen on a rig with 2.4 m of hose,
@@ -81,6 +86,8 @@ AGAIN = NARROWING[3:]
 # Most that one sigma of the parameters may raise chi-square, and halvings until it does. A linear
 # model rises by 1 at most; chosen: one that bends may rise by as much as two sigmas of that.
 MOST_RISE, MOST_HALVINGS = 4.0, 8
+# For another explanation of the record, from a start near it.
+WITH_LEAK = Round(1, 0.3, 0.6 * MBAR, 25, 1e-4)
 # Sigmas beyond which the robust loss grows more slowly than the square of a residual.
 ROBUST = 8.0
 
@@ -126,6 +133,17 @@ class Problem:
         backwards = np.where(x - self.space.step >= self.space.low, -self.space.step, forwards)
         sides = [sensitivities(self._predict, x, steps)[1] for steps in (forwards, backwards)]
         return np.asarray(np.mean(sides, axis=0), np.float64)
+
+    def misfit(self, datasets: Sequence[DataSet]) -> Floats:
+        """Chi-square of the record by each data set, without the prior."""
+        residuals = self.cycles.residuals(np.stack([*map(coefficients, datasets)], axis=1))
+        chi2: Floats = np.sum(np.concatenate(self.weights.white(residuals)) ** 2, axis=0)
+        return chi2
+
+    def most_misfit(self, least: float) -> float:
+        """Chi-square up to which a data set fits as well as the best one, with ``least``."""
+        residual_count = sum(len(rows) for rows, _ in self.weights.parts)
+        return least + MOST_RISE * max(least / residual_count, 1.0)
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -194,6 +212,7 @@ class Fitted:
     left: float  # Pa rms of the residual in the fitted cycles
     scaled: npt.NDArray[np.bool_]  # parameters whose logarithm is normally distributed
     deepest: float = np.nan  # Pa, lowest pressure of the record; NaN if the type is known
+    leaky: DataSet | None = None  # of an ejector with more suction and leak, if it fits as well
 
     @property
     def reaches_end(self) -> bool:
@@ -213,6 +232,9 @@ class Fitted:
     def determined(self) -> npt.NDArray[np.bool_]:
         """Which parameters the log determines; the others come from the type."""
         is_determined: npt.NDArray[np.bool_] = self.spread < DETERMINED * self.prior
+        if self.leaky:
+            apart = np.abs(values(self.leaky, self.free) - values(self.data, self.free))
+            is_determined &= apart < DETERMINED * self.prior
         is_determined[self._number(END_PRESSURE)] &= self.reaches_end
         return is_determined
 
@@ -222,8 +244,18 @@ class Fitted:
         A parameter that the log does not determine may be zero if its bounds allow that, as a leak
         may. Flows and volumes are at most as exact as the volumes that were told. If the record
         does not come near the end pressure, that is only known to lie below the deepest pressure:
-        the record does not show how the characteristic continues.
+        the record does not show how the characteristic continues. Where more suction and more leak
+        fit as well, the interval holds their values, and the best end pressure of the market.
         """
+        low, high = self._near_best(name)
+        if self.leaky is None:
+            return low, high
+        value = self.free[self._number(name)].of(self.leaky)
+        least = BEST_END / MBAR if name == END_PRESSURE else value
+        return min(low, value, least), max(high, value)
+
+    def _near_best(self, name: str) -> tuple[float, float]:
+        """95 % interval by the neighbourhood of the best fit."""
         if name == END_PRESSURE and not self.reaches_end:
             return min(BEST_END, self.deepest) / MBAR, self.deepest / MBAR
         number = self._number(name)
@@ -312,7 +344,64 @@ def fit_from_afar(
     )
     pressure = samples["pressure"][(samples["quality"] & UNUSABLE) == 0]
     deepest = float(np.nanquantile(pressure, DEEPEST))
-    return replace(_fitted(problem, best.x), deepest=deepest)
+    fitted = replace(_fitted(problem, best.x), deepest=deepest)
+    progress("asking whether the record tells suction from leak")
+    return replace(fitted, leaky=_leaky(samples, problem, fitted, noises))
+
+
+def _leaky(
+    samples: Samples, problem: Problem, fitted: Fitted, noises: Sequence[float]
+) -> DataSet | None:
+    """Data of an ejector with a better end pressure and a larger leak that fit as well, or None.
+
+    While the nozzle runs, a record shows only the difference of suction and leak. The leak shows
+    alone where the nozzle is off and the system is evacuated.
+    """
+    guess = with_more_leak(fitted.data, fitted.deepest)
+    if guess is None:
+        return None
+    space = Space.of_market(guess, problem.space.free)
+    start = _followed(samples, _Start(space, np.zeros(len(space.free))), WITH_LEAK, noises)
+    leaky = falling(start.data)
+    chi2 = problem.misfit([fitted.data, leaky])
+    has_more = leaky.system.leak_sl_min - fitted.data.system.leak_sl_min > LEAST_MORE * (
+        leaky.ejector.suction_capacity_sl_min
+    )
+    return leaky if has_more and chi2[1] <= problem.most_misfit(float(chi2[0])) else None
+
+
+def with_more_leak(data: DataSet, deepest: float) -> DataSet | None:
+    """``data`` with a BETTER end pressure, and leak and bends for nearly the same net flow.
+
+    None if the end pressure is good already. ``deepest`` (Pa) is the lowest pressure in use.
+    """
+    ejector, system, ambient = data.ejector, data.system, data.ambient.pressure_mbar
+    capacity, end = ejector.suction_capacity_sl_min, ejector.end_pressure_mbar
+    if end < GOOD_END / MBAR:
+        return None
+    pressure, better_end = np.linspace(max(deepest / MBAR, end), ambient, RISING + 1), BETTER * end
+    as_found = (pressure - end) / (ambient - end)
+    better = (pressure - better_end) / (ambient - better_end)
+    ratios = (pressure / ambient).tolist()
+    leaking = np.array([orifice(ratio, system.leak_critical_ratio)[0] for ratio in ratios])
+    net = capacity * ejector.share(as_found) - system.leak_sl_min * leaking
+    leak = float((capacity * ejector.share(better) - net)[0] / leaking[0])
+    unbent = ejector.model_copy(update=dict.fromkeys(BENDS, 0.0))
+    columns = (
+        (1.0 - ejector.kink)
+        * (better * (1.0 - better))[:, None]
+        * np.vander(better, len(BENDS), increasing=True)
+    )
+    target = (net + leak * leaking) / capacity - unbent.share(better)
+    bends = dict(zip(BENDS, np.linalg.lstsq(columns, target)[0].tolist(), strict=True))
+    return falling(
+        data.model_copy(
+            update={
+                "ejector": ejector.model_copy(update={"end_pressure_mbar": better_end} | bends),
+                "system": system.model_copy(update={"leak_sl_min": leak}),
+            }
+        )
+    )
 
 
 def _kept(starts: Sequence[_Start], count: int) -> list[_Start]:
@@ -449,26 +538,18 @@ def _fitted(problem: Problem, x: Floats) -> Fitted:
     first_residual = residuals[: len(cycles.bins.count), 0]
     rms = float(np.sqrt(np.average(first_residual**2, weights=cycles.bins.count)))
     root = np.asarray(np.linalg.cholesky(slopes @ plain @ slopes.T), np.float64)
-    factor = _allowed(problem, best, root)
+    factor = allowed(problem, best, root)
     return Fitted(best, space.free, covariance, factor, prior, rms, space.scaled)
 
 
-def _allowed(problem: Problem, best: DataSet, factor: Floats) -> Floats:
+def allowed(problem: Problem, best: DataSet, factor: Floats) -> Floats:
     """``factor`` of a covariance of parameters, its columns as long as the record allows.
 
     The covariance counts the model as linear. Where that bends, one sigma of a column may
     contradict the record, on one side at least: then the column is halved until it does not.
     """
-
-    def misfit(datasets: Sequence[DataSet]) -> Floats:
-        residuals = problem.cycles.residuals(np.stack([*map(coefficients, datasets)], axis=1))
-        chi2: Floats = np.sum(np.concatenate(problem.weights.white(residuals)) ** 2, axis=0)
-        return chi2
-
     names = [free.name for free in problem.space.free]
-    (least,) = misfit([best])
-    residual_count = sum(len(rows) for rows, _ in problem.weights.parts)
-    most = float(least) + MOST_RISE * max(float(least) / residual_count, 1.0)
+    most = problem.most_misfit(float(problem.misfit([best])[0]))
     factor = factor.copy()
     too_long = np.arange(len(names))
     for _ in range(MOST_HALVINGS):
@@ -477,7 +558,7 @@ def _allowed(problem: Problem, best: DataSet, factor: Floats) -> Floats:
             for column in too_long
             for side in both_sides(best, dict(zip(names, factor[:, column].tolist(), strict=True)))
         ]
-        too_long = too_long[misfit(sides).reshape(-1, 2).max(axis=1) > most]
+        too_long = too_long[problem.misfit(sides).reshape(-1, 2).max(axis=1) > most]
         if not len(too_long):
             break
         factor[:, too_long] /= 2.0

@@ -285,7 +285,7 @@ class Evidence:
     def parameter_sensitivity(self) -> ParameterSensitivity:
         """Responses of the twin without causes to each uncertainty of its data set."""
         ups, downs = ([getattr(shift, side) for shift in self.uncertain] for side in ("up", "down"))
-        near = [self.theta + NEARBY * (up - self.theta) for up in ups]
+        near = [shift.near(self.theta, NEARBY) for shift in self.uncertain]
         bases = [self.theta, *near, *ups, *downs]
         _, changes = derivatives(self.off([HEALTHY] * len(bases), bases))
         nearby, up, down = np.split(changes, 3, axis=1)
@@ -653,8 +653,8 @@ def _read(base: Evidence, blocks: Iterable[Samples]) -> LogCycles:
         base,
         theta=theta,
         uncertain=tuple(
-            Shift(surrounded(up, medians), surrounded(down, medians), tied)
-            for up, down, tied in base.uncertain
+            shift._replace(up=surrounded(shift.up, medians), down=surrounded(shift.down, medians))
+            for shift in base.uncertain
         ),
         told=frozenset(medians),
         detector=detector,

@@ -125,6 +125,9 @@ _DOUBTS = (  # that a record is of a healthy unit, and what to do
     "what counts as healthy from now on never reaches H1, {h1} mbar: the vacuum is {highest} mbar"
     " at most",
     "look for leaks and a low supply, or let suction last longer, and record again",
+    "what counts as healthy from now on may leak {leak} sl/min: with an end pressure of {end} mbar"
+    " the record fits as well",
+    "leave half a second with both off after suction and record again, if a leak matters",
     "{name} is {value} {unit}, where {low} to {high} is healthy for its type",
     "suction capacity",
     "end pressure",

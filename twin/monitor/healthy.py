@@ -56,7 +56,8 @@ class Healthy(Settings):
 
     ``figures`` are the mean and scatter of each figure. ``error`` is the model's error by kind of
     stretch. ``scatter`` maps an effect to one sigma of its size from cycle to cycle. ``uncertain``
-    is the lower Cholesky factor of the data set's covariance, a row for each value.
+    is the lower Cholesky factor of the data set's covariance, a row for each value. ``leaky`` are
+    changes of values to a larger leak with more suction, if the record fits that as well.
     ``unseen_level_mbar`` is one sigma of a switching level that no healthy cycle shows.
     ``meets_ms`` is one sigma of the time at which cups meet the part, if that is after suction
     began. ``rounding_mbar`` is one sigma of the rounding error in a mean of many readings.
@@ -68,6 +69,7 @@ class Healthy(Settings):
     scatter: Mapping[str, float] = Field(default_factory=dict)
     leftover: float = Field(1.0, gt=0.0)  # reduced chi of healthy cycles by this distribution
     uncertain: Mapping[str, tuple[float, ...]] = Field(default_factory=dict)
+    leaky: Mapping[str, float] = Field(default_factory=dict)
     unseen_level_mbar: float = Field(UNSEEN_LEVEL_MBAR, gt=0.0)
     meets_ms: float = Field(MEETS_MS, gt=0.0)
     rounding_mbar: float = Field(0.0, ge=0.0)

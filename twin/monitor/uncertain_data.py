@@ -35,6 +35,11 @@ class Shift(NamedTuple):
     up: Theta
     down: Theta
     tied: bool = False  # several values move together, as only the calibration's record tells
+    is_far: bool = False  # another explanation of that record, with nothing between
+
+    def near(self, theta: Theta, share: float) -> Theta:
+        """Coefficients a share of the way up from ``theta``; those themselves if it is far."""
+        return theta if self.is_far else theta + share * (self.up - theta)
 
 
 def shifted(data: DataSet, healthy: Healthy) -> Iterator[Shift]:
@@ -50,6 +55,9 @@ def shifted(data: DataSet, healthy: Healthy) -> Iterator[Shift]:
         tied = any(abs(row[way]) > TIES * math.hypot(*row) for _, row in rows[way + 1 :])
         sides = both_sides(data, {name: row[way] for name, row in rows[way:]})
         yield Shift(*_coefficients(sides), tied)
+    if healthy.leaky:
+        leaky, _ = both_sides(data, healthy.leaky)
+        yield Shift(coefficients(leaky), coefficients(data), tied=True, is_far=True)
 
 
 def drawn(data: DataSet, healthy: Healthy, rng: np.random.Generator) -> Theta:
