@@ -105,6 +105,7 @@ def test_what_follows_contact_comes_later_as_a_whole() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # a commissioning, on a computer that does other things beside
 def test_a_rig_of_another_world_that_meets_the_part_late_is_healthy() -> None:
     """Cups come upon the part 60 ms after suction began; one sigma of that is 2 ms.
 
