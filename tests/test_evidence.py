@@ -34,7 +34,7 @@ def test_a_value_that_is_open_by_more_than_itself_keeps_to_its_bounds() -> None:
     samples, _ = rigs.recorded("test_rig", 12.0)
     evidence = collect(replace(config, monitor=monitor), [samples])
     healthy_relief = coefficients(config.data)[c.RELIEF]
-    up, down, _ = evidence.uncertain[-1]
+    up, down, *_ = evidence.uncertain[-1]
     assert up[c.RELIEF] == pytest.approx(4.0 * healthy_relief)
     assert 0.0 < down[c.RELIEF] < healthy_relief
 
