@@ -48,7 +48,7 @@ settings.load_profile("untimed")
 # one at the end, and those that calculate beside those that wait for a PLC or a browser.
 FIRST = (
     *("battery", "journeys", "hidden_mechanisms", "diagnosis", "fault_run", "base_installation"),
-    *("hidden_mechanisms_second", "peers"),
+    *("hidden_mechanisms_second", "rhythms_commissioned", "peers"),
     *("first_change", "page_browser", "mechanisms", "hil", "site", "another_day", "run_many"),
     *("unmodelled", "cli", "commission", "written_pages", "signal_checks", "page_past", "results"),
     *("healthy", "started_at_once", "measured_supply", "calibration", "page_all", "report", "aas"),
