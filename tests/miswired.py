@@ -23,3 +23,16 @@ def counted(scale: float, offset: float) -> Callable[[Samples], None]:
         samples["pressure"] = scale * samples["pressure"] + offset * np.float32(101300.0)
 
     return change
+
+
+# What is wrong, and what is said of it, whatever the record is for.
+MISWIRED = [
+    (swapped, "the two commands are swapped"),
+    (counted(-1.0, 2.0), "its sign is wrong"),
+    (counted(1.0, -1.0), "gauge pressure, taken for absolute"),
+    (counted(1.0, 1.0), "absolute pressure, taken for gauge"),
+    (counted(-1.0, 1.0), "vacuum, taken for absolute pressure"),
+    (counted(0.1, 0.0), "mbar absolute: too little"),
+    (counted(10.0, 0.0), "no vacuum does so"),
+    (counted(0.001, 0.999), "no vacuum is made"),
+]

@@ -12,7 +12,7 @@ import rigs
 import written_pages
 from calibrations import CYCLES, beside, calibrated, log_of, quiet, rig, typed
 from command_line import twin as command
-from miswired import counted, no_blow_off, swapped
+from miswired import MISWIRED, no_blow_off
 from test_retelling import ENGLISH_WORDS, GERMAN, in_german
 
 from tools.calibration_coverage import SYSTEMS, TRUE, drawn, misses, recorded
@@ -266,14 +266,7 @@ def test_what_is_refused_is_not_stored_and_its_answer_is_written(
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (swapped, "the two commands are swapped"),
-        (counted(-1.0, 2.0), "its sign is wrong"),
-        (counted(1.0, -1.0), "gauge pressure, taken for absolute"),
-        (counted(1.0, 1.0), "absolute pressure, taken for gauge"),
-        (counted(-1.0, 1.0), "vacuum, taken for absolute pressure"),
-        (counted(0.1, 0.0), "mbar absolute: too little"),
-        (counted(10.0, 0.0), "no vacuum does so"),
-        (counted(0.001, 0.999), "no vacuum is made"),
+        *MISWIRED,
         (no_blow_off, "no row has blow-off commanded"),
     ],
 )

@@ -13,7 +13,7 @@ import rigs
 from calibrations import log_of, quiet, typed
 from hypothesis import given
 from hypothesis import strategies as st
-from miswired import counted, no_blow_off, swapped
+from miswired import MISWIRED, counted, no_blow_off
 from second_rigs import UNKNOWN_TYPE, config_of, samples_of
 from second_world.draw import draw_rig
 from second_world.faults import Fault
@@ -599,16 +599,9 @@ def refused(samples: Samples) -> str:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (swapped, "the two commands are swapped"),
-        (counted(-1.0, 2.0), "its sign is wrong"),
-        (counted(1.0, -1.0), "gauge pressure, taken for absolute"),
-        (counted(1.0, 1.0), "absolute pressure, taken for gauge"),
-        (counted(-1.0, 1.0), "vacuum, taken for absolute pressure"),
-        (counted(0.1, 0.0), "mbar absolute: too little"),
-        (counted(10.0, 0.0), "no vacuum does so"),
+        *MISWIRED,
         (counted(14.5, -13.5), "no vacuum does so"),  # a vacuum in psi, read as bar
         (counted(1000.0, 0.0), "no vacuum does so"),
-        (counted(0.001, 0.999), "no vacuum is made"),
     ],
 )
 def test_what_is_connected_wrongly_is_recognised_from_the_curves(

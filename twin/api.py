@@ -234,17 +234,17 @@ class Calibrated:
     @property
     def verdict(self) -> str:
         """Good, usable, or refused: off by more than twice what the cycles of the log differ by."""
-        return self._calibration.verdict.word
+        return self._outcome.verdict.word
 
     @property
     def remarks(self) -> list[str]:
         """What the record contradicts in the configuration, and the line to write instead."""
-        return [f"{remark.text}: {remark.line}" for remark in self._calibration.remarks]
+        return [f"{remark.text}: {remark.line}" for remark in self._outcome.remarks]
 
     @property
     def doubts(self) -> list[str]:
         """Reasons to doubt that the unit is healthy, each with what to do."""
-        return [f"{doubt.text}: {doubt.action}" for doubt in self._calibration.doubts]
+        return [f"{doubt.text}: {doubt.action}" for doubt in self._outcome.doubts]
 
     @property
     def rms_mbar(self) -> float:
@@ -277,6 +277,11 @@ class Calibrated:
         record, _ = store(self._calibration, self.config, self._log.assets, self._log.path)
         return record
 
+    @property
+    def _outcome(self) -> Calibration | Commissioning:
+        """What the verdict, the remarks and the doubts are of."""
+        return self._calibration
+
     def _samples(self) -> Samples:
         return joined(np.empty(0, SAMPLE), *self._log._samples())
 
@@ -294,19 +299,8 @@ class Commissioned(Calibrated):
         return calibration_page.summary(self._commissioning, self.config.asset)
 
     @property
-    def verdict(self) -> str:
-        """Good, usable or refused."""
-        return self._commissioning.verdict.word
-
-    @property
-    def remarks(self) -> list[str]:
-        """What the record contradicts in the configuration, and the line to write instead."""
-        return [f"{remark.text}: {remark.line}" for remark in self._commissioning.remarks]
-
-    @property
-    def doubts(self) -> list[str]:
-        """Reasons to doubt that the unit is healthy, each with what to do."""
-        return [f"{doubt.text}: {doubt.action}" for doubt in self._commissioning.doubts]
+    def _outcome(self) -> Commissioning:
+        return self._commissioning
 
     def report(self, path: Place, language: str = "en") -> None:
         """Write it with pictures as one HTML file, in a language such as ``de``.
