@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Self
 
 ROOT = Path(__file__).parents[1]
+PATIENCE_S = 30.0  # on a busy machine an end takes longer than elsewhere
 
 
 class PlcProcess:
@@ -30,7 +31,7 @@ class PlcProcess:
 
     def _ended(self) -> int:
         try:
-            return self.process.wait(5)
+            return self.process.wait(PATIENCE_S)
         finally:
             assert self.process.stdout is not None
             self.process.stdout.close()
@@ -62,5 +63,5 @@ def start_plc(config: Path, *args: str, port: int = 0) -> PlcProcess:
     line = process.stdout.readline()
     if not line.startswith("listening on "):
         with contextlib.closing(process.stdout):
-            raise RuntimeError(f"the PLC did not start (exit code {process.wait(10)}): {line!r}")
+            raise RuntimeError(f"the PLC did not start (exit code {process.wait(PATIENCE_S)}): {line!r}")
     return PlcProcess(process, int(line.rsplit(":", 1)[1]))
