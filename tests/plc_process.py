@@ -63,5 +63,7 @@ def start_plc(config: Path, *args: str, port: int = 0) -> PlcProcess:
     line = process.stdout.readline()
     if not line.startswith("listening on "):
         with contextlib.closing(process.stdout):
-            raise RuntimeError(f"the PLC did not start (exit code {process.wait(PATIENCE_S)}): {line!r}")
+            raise RuntimeError(
+                f"the PLC did not start (exit code {process.wait(PATIENCE_S)}): {line!r}"
+            )
     return PlcProcess(process, int(line.rsplit(":", 1)[1]))

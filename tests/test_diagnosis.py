@@ -401,6 +401,7 @@ def test_what_no_mechanism_explains_gets_a_term_that_takes_it_away(
     assert answer["unlisted"]["mechanism"] is None
     assert {term.where for term in diagnosis.terms} >= {"suction"}
     assert answer["extended"]["rms_mbar"] < 0.5 * answer["baseline"]["rms_mbar"]
+    assert answer["next_experiment"].startswith("record cycles with suction to the end vacuum")
 
 
 @pytest.mark.slow

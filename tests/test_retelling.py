@@ -138,6 +138,13 @@ def test_what_to_measure_beside_weather_is_german(
     assert "5.6 mbar" in sentence
 
 
+@pytest.mark.parametrize("phase", list(experiments.LONGER))
+def test_what_shows_more_of_something_unlisted_is_german(phase: str) -> None:
+    sentence = experiments.show_more(phase)
+    assert f"is largest in {phase.replace('_', '-')}" in sentence
+    assert not ENGLISH_WORDS.search(in_german(sentence))
+
+
 @pytest.mark.parametrize("over", ["time", "vacuum", None])
 def test_the_shape_of_something_unlisted_is_german(over: Any) -> None:
     terms = (Term(where="hold", over=over, at=(0.0, 30.0), mbar=(1.0, 2.5)),) if over else ()

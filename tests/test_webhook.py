@@ -184,7 +184,7 @@ def test_a_server_that_comes_later_gets_everything_in_order(tmp_path: Path) -> N
 
 def test_a_server_that_does_not_answer_is_asked_again(tmp_path: Path, server: Server) -> None:
     server.hangs.set()
-    bench = At(tmp_path / "a.sqlite", server.port, timeout_s=0.05)
+    bench = At(tmp_path / "a.sqlite", server.port, timeout_s=0.5)
     bench.put(message(1))
     wait_until(lambda: bool(bench.said))
     server.hangs.clear()

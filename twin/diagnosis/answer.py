@@ -19,7 +19,7 @@ from twin.diagnosis.evidence import (
     read_cycles,
     thinned,
 )
-from twin.diagnosis.experiments import beside_weather, next_experiment
+from twin.diagnosis.experiments import beside_weather, next_experiment, show_more
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
@@ -185,7 +185,7 @@ def diagnose(
         "gain": gain(before, findings.after),
         "next_experiment": _odd_cycles(evidence, healthy) or like_weather
         if findings.verdict == "consistent"
-        else next_experiment(evidence, findings.searched, findings.mechanism),
+        else _next_experiment(evidence, findings, healthy),
     }
     return Diagnosis(
         evidence,
@@ -261,6 +261,16 @@ def _with_unlisted(
         )
         findings = replace(findings, strange=strange, terms=strange.terms)
     return replace(findings, after=mended or findings.after, mechanism=mechanism)
+
+
+def _next_experiment(evidence: Evidence, findings: _Findings, healthy: Covariance) -> str | None:
+    """What to record or measure next; None if one cause alone explains the log."""
+    if recording := next_experiment(evidence, findings.searched, findings.mechanism):
+        return recording
+    about = findings.searched.known if findings.causes else healthy
+    weather = beside_weather(evidence, about, findings.causes)
+    is_unlisted = findings.verdict == "unlisted"
+    return weather or (show_more(findings.strange.where) if is_unlisted else None)
 
 
 def _on_unseen(

@@ -51,6 +51,13 @@ def _less_supply(theta: Theta) -> None:
     theta[c.SUPPLY] -= SUPPLY_STEP
 
 
+# A recording that shows more of what nobody listed, by the phase in which most of it is left.
+LONGER = {
+    "idle": "cycles with three times as long an idle",
+    "suction": "cycles with suction to the end vacuum, the air saving switched off",
+    "hold": "cycles with three times as long a hold",
+    "blow_off": "cycles with three times as long a blow-off",
+}
 _CYCLE = ((_SUCTION, 1500), (_BLOW, 300), (_OFF, 700))
 # Tests in order of cost, the cheapest first.
 TESTS = (
@@ -105,23 +112,34 @@ def next_experiment(
     return _recording(evidence, hypothesis, [rival.hypothesis for rival in rivals], text, names)
 
 
-def beside_weather(evidence: Evidence, healthy: Covariance) -> str | None:
-    """What to measure if a ``consistent`` log deviates as under another weather; else None.
+def beside_weather(
+    evidence: Evidence, about: Covariance, hypothesis: Hypothesis = HEALTHY
+) -> str | None:
+    """What to measure if a log deviates from a hypothesis as under another weather; else None.
 
-    Such a log is consistent only because nobody measured the weather. A fault could hide in it.
+    Nobody measured the weather, so a fault could hide in it. ``about`` is the covariance about the
+    hypothesis.
     """
     unmeasured = [name for name in ("ambient", "temperature") if name not in evidence.told]
     if not unmeasured:
         return None
-    (off,) = evidence.off([HEALTHY]).T
+    (off,) = evidence.off([hypothesis]).T
     count = evidence.bins.count
-    explained = float(np.sqrt(np.average(explained_by_day(healthy, off) ** 2, weights=count)))
-    if not explained > HIDES * healthy.of(evidence.judged).usual:
+    explained = float(np.sqrt(np.average(explained_by_day(about, off) ** 2, weights=count)))
+    if not explained > HIDES * about.of(evidence.judged).usual:
         return None
     missing = {"ambient": "ambient pressure", "temperature": "temperature"}[unmeasured[0]]
     return (
         f"record {missing} as well: {explained:.1f} mbar of the deviation (rms) look like another"
         " weather, and a fault of that size could hide behind it"
+    )
+
+
+def show_more(phase: str) -> str:
+    """The recording that shows more of what nobody listed, if most of it is left in ``phase``."""
+    return (
+        f"record {LONGER[phase]}: what is left is largest in {phase.replace('_', '-')}, and how it goes on"
+        " there tells what it may be"
     )
 
 

@@ -39,6 +39,12 @@ _EXPERIMENTS = (  # what to record next
     " fault of that size could hide behind it",
     "ambient pressure",
     "temperature",
+    "record {test}: what is left is largest in {phase}, and how it goes on there tells what it may"
+    " be",
+    "cycles with three times as long an idle",
+    "cycles with suction to the end vacuum, the air saving switched off",
+    "cycles with three times as long a hold",
+    "cycles with three times as long a blow-off",
     "cycle {cycle} alone deviates, by {size} mbar (rms): so few cannot show a cause; record more"
     " cycles if it comes again",
     "cycles {cycles} alone deviate, by {size} mbar (rms): so few cannot show a cause; record more"

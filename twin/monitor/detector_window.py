@@ -12,7 +12,11 @@ from twin.model.air import GAMMA, R
 from twin.model.dataset import DataSet, coefficients, swing
 from twin.model.plant import suction_at
 from twin.model.theta import Theta
-from twin.monitor.simulated_switching import bend_in_free_run, detected_switching
+from twin.monitor.simulated_switching import (
+    bend_in_free_run,
+    detected_switching,
+    shortest_interval,
+)
 from twin.monitor.switching_detector import (
     SHORTEST_WINDOW,
     SIGNIFICANT,
@@ -27,6 +31,8 @@ LONGEST_WINDOW = 240  # rows
 NEVER = 2**31  # rows from the start of a suction: no breakpoint is searched
 SETTLED = 20e-3  # s after the valve's response before the first breakpoint
 AGAIN = 30e-3  # s from a breakpoint to the next search: lines ring in that time
+# Of the shortest time between switchings in a free run: a quick ejector is searched again sooner.
+SOONER = 0.5
 AT_ONCE = 2  # rows: smaller shifts are ignored; calibrated lag and shift would chase each other
 HELD = 2.0  # s that the nozzle stays off in the free run
 LONGEST_RUN = 60_000  # rows of a free run
@@ -136,7 +142,8 @@ def _as_in_free_run(detector: DetectorSettings, theta: Theta) -> DetectorSetting
     if 0 < leaking.on_rows <= most_rows:
         detector = replace(detector, on_shift=leaking.on_rows)
     apart = min(RINGS * tight.rings, MOST_APART * float(theta[c.H1] - theta[c.H1_LOW]))
-    again = max(detector.again, detector.on_shift, detector.off_shift)
+    sooner = SOONER * shortest_interval(theta, rows, detector.period) / detector.period
+    again = max(int(min(detector.again, sooner)), detector.on_shift, detector.off_shift)
     goes_off = float(theta[c.AMBIENT_NOMINAL]) - tight.off * MBAR
     return replace(detector, again=again, apart=apart, goes_off=goes_off)
 

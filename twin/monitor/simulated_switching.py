@@ -100,6 +100,13 @@ def bend_in_free_run(theta: Theta, rows: int, period: float) -> float:
     return float(fall + rise) / SHORTEST_WINDOW
 
 
+def shortest_interval(theta: Theta, rows: int, period: float) -> float:
+    """Shortest time (s) between switchings of the nozzle in a free run; infinite below two."""
+    control = _run(theta, rows, period).control
+    switched = np.sort(np.concatenate([_switched(control, name) for name in _OTHER]))
+    return float(np.diff(switched).min()) * MS if len(switched) > 1 else np.inf
+
+
 def _suction(rows: int, period: float) -> Samples:
     """Samples of a suction from rest, without pressure."""
     samples = np.zeros(IDLE_ROWS + rows, SAMPLE)
