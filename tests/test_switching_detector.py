@@ -370,6 +370,45 @@ def test_a_tube_that_rings_does_not_switch_the_nozzle(seed: int, fault: str) -> 
     assert len(found_where_true(samples, truth, detector)) >= 10
 
 
+def of_20_ml(leak: float, hysteresis: float) -> tuple[PlcSettings, DataSet]:
+    """A gripper of 20 ml with quick valves, and its data set; leak in sl/min, hysteresis in mbar."""
+    plc = rigs.config("gripper").document.section(PlcSettings, "plc").model_dump()
+    plc["rig"] |= {"line_ml": 1.3, "line_length_m": 0.1, "vessel_ml": 14.0, "opening_sl_min": 60.0}
+    plc["rig"] |= {"vessel_area_m2": 0.005, "seal_leak_sl_min": leak}
+    plc["ejector"] |= {"build_up_ms": 2.0, "collapse_ms": 1.0}
+    plc["valves"] |= {"suction_on_ms": 4.0, "suction_off_ms": 3.0}
+    plc["sensor"]["lag_ms"] = 0.5
+    plc["control"]["h1_hysteresis_mbar"] = hysteresis
+    plc["program"] |= {"suction_ms": 600.0, "start_ms": 500.0}
+    data = rigs.config("gripper").data.model_dump()
+    data["ejector"] |= {"response_ms": 4.0, "response_off_ms": 4.0, "port_volume_ml": 5.0}
+    data["ejector"] |= {"ramp_up_ms": 2.0, "ramp_down_ms": 2.0, "h1_hysteresis_mbar": hysteresis}
+    data["sensor"]["lag_ms"] = 1.0
+    sensor, tube, cups = data["system"]["parts"]
+    data["system"]["parts"] = (
+        sensor,
+        tube | {"length_mm": 100.0},
+        cups | {"volume_ml": 14.0, "wall_area_cm2": 50.0},
+    )
+    data["system"]["leak_sl_min"] = leak
+    return PlcSettings.model_validate(plc), DataSet.model_validate(data)
+
+
+@pytest.mark.parametrize(("leak", "hysteresis"), [(2.0, 60.0), (3.0, 40.0), (4.0, 60.0)])
+def test_a_nozzle_that_switches_every_40_ms_is_followed_live(
+    leak: float, hysteresis: float
+) -> None:
+    plc, data = of_20_ml(leak, hysteresis)
+    parts = zip(*with_truth(plc, SECONDS / 2.0, [], 3), strict=True)
+    samples, truth = (np.concatenate(column) for column in parts)
+    detector = expected_detector(coefficients(data), data.sensor.noise_mbar * MBAR)
+    late = found_where_true(samples, truth, detector)
+    assert len(late) >= 130
+    assert max(map(abs, late)) <= 5
+    with pytest.raises(AssertionError):  # lines of other grippers ring for longer
+        found_where_true(samples, truth, replace(detector, again=rigs.detector("gripper").again))
+
+
 def test_no_breakpoint_is_near_the_level_of_the_last() -> None:
     """The slope breaks as it does where the nozzle goes on, but the pressure has hardly risen."""
     slopes = np.repeat([-100.0, 100.0, -30.0, 10.0, -100.0], [300, 40, 40, 400, 200])  # Pa per row

@@ -19,7 +19,7 @@ from twin.diagnosis.evidence import (
     read_cycles,
     thinned,
 )
-from twin.diagnosis.experiments import beside_weather, next_experiment, show_more
+from twin.diagnosis.experiments import MOSTLY, beside_weather, next_experiment, show_more
 from twin.diagnosis.fit import Fitted, white
 from twin.diagnosis.healthy import apart, are_odd, left_in_each, usual_leftover
 from twin.diagnosis.held_out import LITTLE, Judged, gain, judge, rounded
@@ -268,7 +268,7 @@ def _next_experiment(evidence: Evidence, findings: _Findings, healthy: Covarianc
     if recording := next_experiment(evidence, findings.searched, findings.mechanism):
         return recording
     about = findings.searched.known if findings.causes else healthy
-    weather = beside_weather(evidence, about, findings.causes)
+    weather = beside_weather(evidence, about, findings.causes, MOSTLY)
     is_unlisted = findings.verdict == "unlisted"
     return weather or (show_more(findings.strange.where) if is_unlisted else None)
 

@@ -24,6 +24,7 @@ ENOUGH = 5.0  # sigmas that separate two causes for certain
 REPEATS = 4  # cycles of a test; the model settles in the first
 MOST_RIVALS = 3
 SUPPLY_STEP = 1.0 * BAR
+MOSTLY = 0.5  # of what causes leave (rms), that weather must explain to be asked for
 HIDES = 1.0  # rms of the deviation that weather explains, over that of healthy cycles
 
 _OFF, _SUCTION, _BLOW = 0, int(Command.SUCTION), int(Command.BLOW_OFF)
@@ -113,20 +114,22 @@ def next_experiment(
 
 
 def beside_weather(
-    evidence: Evidence, about: Covariance, hypothesis: Hypothesis = HEALTHY
+    evidence: Evidence, about: Covariance, hypothesis: Hypothesis = HEALTHY, share: float = 0.0
 ) -> str | None:
     """What to measure if a log deviates from a hypothesis as under another weather; else None.
 
     Nobody measured the weather, so a fault could hide in it. ``about`` is the covariance about the
-    hypothesis.
+    hypothesis; weather must explain this ``share`` of the deviation's rms.
     """
     unmeasured = [name for name in ("ambient", "temperature") if name not in evidence.told]
     if not unmeasured:
         return None
     (off,) = evidence.off([hypothesis]).T
-    count = evidence.bins.count
-    explained = float(np.sqrt(np.average(explained_by_day(about, off) ** 2, weights=count)))
-    if not explained > HIDES * about.of(evidence.judged).usual:
+    parts = explained_by_day(about, off), off
+    explained, deviation = (
+        float(np.sqrt(np.average(part**2, weights=evidence.bins.count))) for part in parts
+    )
+    if not explained > max(HIDES * about.of(evidence.judged).usual, share * deviation):
         return None
     missing = {"ambient": "ambient pressure", "temperature": "temperature"}[unmeasured[0]]
     return (
