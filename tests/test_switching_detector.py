@@ -371,7 +371,7 @@ def test_a_tube_that_rings_does_not_switch_the_nozzle(seed: int, fault: str) -> 
 
 
 def of_20_ml(leak: float, hysteresis: float) -> tuple[PlcSettings, DataSet]:
-    """A gripper of 20 ml with quick valves, and its data set; leak in sl/min, hysteresis in mbar."""
+    """A gripper of 20 ml with quick valves, and its data set; leak in sl/min, width in mbar."""
     plc = rigs.config("gripper").document.section(PlcSettings, "plc").model_dump()
     plc["rig"] |= {"line_ml": 1.3, "line_length_m": 0.1, "vessel_ml": 14.0, "opening_sl_min": 60.0}
     plc["rig"] |= {"vessel_area_m2": 0.005, "seal_leak_sl_min": leak}

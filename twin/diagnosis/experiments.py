@@ -140,9 +140,10 @@ def beside_weather(
 
 def show_more(phase: str) -> str:
     """The recording that shows more of what nobody listed, if most of it is left in ``phase``."""
+    where = phase.replace("_", "-")
     return (
-        f"record {LONGER[phase]}: what is left is largest in {phase.replace('_', '-')}, and how it goes on"
-        " there tells what it may be"
+        f"record {LONGER[phase]}: what is left is largest in {where}, and how it goes on there"
+        " tells what it may be"
     )
 
 
