@@ -203,7 +203,8 @@ def test_only_what_is_fit_to_be_judged_says_something() -> None:
     cycles = list(cut([rigs.expectation(rigs.twin("gripper"), [samples])]))
     theta = rigs.theta("gripper")
     looks = [
-        CycleView(cycle, None, figures(cycle, theta), fit=cycle.index != 2) for cycle in cycles
+        CycleView(cycle, None, figures(cycle, theta), fit=cycle.index != 2, theta=theta)
+        for cycle in cycles
     ]
     isolation = rigs.isolating("gripper").isolation
     assert isolation

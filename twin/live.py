@@ -20,7 +20,7 @@ from twin.monitor.gaps import ShortGaps
 from twin.monitor.monitor import Monitor, in_order
 from twin.monitor.rows import TimeSteps
 from twin.monitor.staleness import Listening
-from twin.monitor.surroundings import are_told, following, stretches
+from twin.monitor.surroundings import Surroundings
 from twin.monitor.switching_detector import DetectorSettings, Found, PhaseFinder
 from twin.signals import SAMPLE, TICK, Command, Phase, Samples, Ticks
 
@@ -59,26 +59,27 @@ class EventEnricher(Protocol):
 class Twin:
     """The model that runs beside the rig; it expects the sensor's reading with a short delay.
 
-    ``nozzle`` is what a whole log shows of it, as for ``PhaseFinder``.
+    ``nozzle`` is what a whole log shows of it, as for ``PhaseFinder``. ``idle``: it follows the
+    weather by an opened idle, as ``Surroundings``.
     """
 
     theta: Theta
     detector: DetectorSettings
     terms: Sequence[Term] = ()
     nozzle: npt.NDArray[np.uint8] | None = None
+    idle: bool = False
     _solver: DenseSolver = field(default_factory=DenseSolver)
     _steps: TimeSteps = field(default_factory=TimeSteps)
-    _phase: int = Phase.IDLE  # of the newest row
 
     def __post_init__(self) -> None:
         self._finder = PhaseFinder(self.detector, self.nozzle)
-        self._surrounded_theta = self.theta  # coefficients with the measured surroundings
+        self._surroundings = Surroundings(self.theta, idle=self.idle)
         self._terms = Terms(self.terms, float(self.theta[c.AMBIENT]))
 
     @classmethod
     def of(cls, data: DataSet) -> "Twin":
         """The twin of a data set."""
-        return cls(coefficients(data), detector_of(data), data.terms)
+        return cls(coefficients(data), detector_of(data), data.terms, idle=True)
 
     def advance(self, block: Samples) -> tuple[Samples, Ticks]:
         """Take a block; returns the settled rows with their ticks."""
@@ -104,28 +105,19 @@ class Twin:
         expected = np.empty(len(samples))
         dt = self._steps.over(samples)
         level, signals = ticks["level"].astype("f8"), np.empty(len(samples), "u1")
-        for rows, surroundings in self._surrounded(samples, ticks):
-            self._surrounded_theta = following(self._surrounded_theta, surroundings)
+        for rows, theta in self._surroundings.over(samples, ticks):
             inputs, outputs = (dt[rows], phase[rows], level[rows]), (expected[rows], signals[rows])
-            dense_solver.advance(self._solver, self._surrounded_theta, *inputs, *outputs)
+            dense_solver.advance(self._solver, theta, *inputs, *outputs)
         self._terms.add(phase, expected)
         ticks["expected"], ticks["signals"] = expected, signals
-        if len(samples):
-            self._phase = int(phase[-1])
         return samples, ticks
-
-    def _surrounded(self, samples: Samples, ticks: Ticks) -> Iterable[tuple[slice, Samples]]:
-        """Slices of rows with constant surroundings; nearly always none are measured."""
-        if are_told(samples):
-            return stretches(samples, ticks, self._phase)
-        return [(slice(None), samples[:0])]
 
 
 def compiled(data: DataSet) -> Twin:
     """A twin with compiled code: without a cache compiling takes seconds, so it is done first."""
     twin = Twin.of(data)
     twin.advance(np.zeros(3 * twin.detector.lag, SAMPLE))
-    return Twin(twin.theta, twin.detector, twin.terms)
+    return Twin(twin.theta, twin.detector, twin.terms, idle=twin.idle)
 
 
 def run(

@@ -132,7 +132,13 @@ def heard(
     for block in blocks(rig, seconds, seed=seed, block=20_000):
         rows, ticks = twin.advance(block)
         views = [
-            CycleView(cycle, None, figures(cycle, twin.theta), cycle.complete and cycle.settled)
+            CycleView(
+                cycle,
+                None,
+                figures(cycle, twin.theta),
+                cycle.complete and cycle.settled,
+                twin.theta,
+            )
             for cycle in cutter.push(rows, ticks)
         ]
         for residual in isolation.extract(views):

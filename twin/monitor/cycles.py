@@ -80,6 +80,7 @@ class CycleView(NamedTuple):
     before: Cycle | None
     figures: Mapping[str, float]
     fit: bool  # it can be judged
+    theta: Theta  # coefficients in its surroundings
 
 
 class CycleKeyFigures(Protocol):

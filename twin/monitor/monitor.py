@@ -33,7 +33,7 @@ from twin.monitor.healthy import NOT_COMMISSIONED
 from twin.monitor.likeness import Likeness
 from twin.monitor.settings import MonitorSettings
 from twin.monitor.signal_checks import ReportWatch
-from twin.monitor.surroundings import following
+from twin.monitor.surroundings import Surroundings, following
 from twin.quality import BREAK, NEW_TIME, Quality
 from twin.signals import NS, SAMPLE, TICK, LastRow, Samples, Ticks, joined
 
@@ -129,6 +129,7 @@ class Monitor:
         from twin.monitor.baseline import Baseline  # noqa: PLC0415 - with SciPy
 
         self._baseline = Baseline(self.settings.healthy)
+        self._surroundings = Surroundings(self.theta)
         nothing = Cycle(0, np.zeros(1, SAMPLE), np.zeros(1, TICK), complete=False)
         figures(nothing, self.theta)
         naming.compiled_for(nothing)
@@ -328,12 +329,14 @@ class Monitor:
             and not stale
             and not is_beside
         )
-        cycle_figures = figures(cycle, following(self.theta, cycle.samples))
+        *_, (_, theta) = self._surroundings.over(cycle.samples, cycle.ticks)
+        theta = following(theta, cycle.samples)
+        cycle_figures = figures(cycle, theta)
         if not self.judges:  # leave out figures that depend on the model
             cycle_figures = {
                 name: value for name, value in cycle_figures.items() if name in MEASURED
             }
-        return CycleView(cycle, before, cycle_figures, fit)
+        return CycleView(cycle, before, cycle_figures, fit, theta)
 
     def _is_beside_an_empty_pick(self, cycle: Cycle) -> bool:
         """Whether a cycle alone met no part, or comes after one: the model has to settle then.
@@ -352,7 +355,7 @@ class Monitor:
         self, view: CycleView, key_figures: CycleKeyFigures | None, scores: "CycleScores | None"
     ) -> list[Event]:
         """Events of a cycle: its summary, and its alarm or clearing."""
-        cycle, before, cycle_figures, judged = view
+        cycle, _, cycle_figures, judged, _ = view
         worst, is_out = self._worst(cycle, cycle_figures) if judged else (None, False)
         far = abs(worst.sigmas) if worst else 0.0
         begins = is_out and self._begins(cycle, far)
@@ -370,7 +373,7 @@ class Monitor:
                 events.append(self._raise_unnamed(worst, cycle))
             elif not self._stands(cycle, worst, cycle_figures, verdict):
                 self._diagnosed = cycle_figures
-                events += self._deviation(worst, before, cycle, verdict)
+                events += self._deviation(worst, view, verdict)
         elif verdict and self._raises_or_names(verdict):
             events.append(self._raise_by_cycles(cycle, verdict))
         elif self.active and not self._is_far(worst) and not self._differs:
@@ -503,13 +506,11 @@ class Monitor:
         self._mixed_cycle = cycle.index
         return True
 
-    def _deviation(
-        self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
-    ) -> list[Event]:
+    def _deviation(self, worst: Outlier, view: CycleView, verdict: "Verdict | None") -> list[Event]:
         """Name the alarm, or rename it if another cause than the standing one fits."""
         if not self._is_commissioned:
             return []
-        ranking = self._rank_causes(worst, before, cycle, verdict)
+        ranking = self._rank_causes(worst, view, verdict)
         self._mixed_cycle = None
         if not ranking:
             self._rival = ("", 0)
@@ -520,7 +521,7 @@ class Monitor:
         observation = (
             f"{worst.place}: {worst.excess:+.1f} mbar from healthy ({worst.sigmas:+.0f} sigma)"
         )
-        return [self._raised(cycle, observation, worst.plain(), ranking)]
+        return [self._raised(view.cycle, observation, worst.plain(), ranking)]
 
     def _small_causes(self, verdict: "Verdict | None") -> Sequence[Likeness]:
         """Causes by the isolation, if the first one is small enough for signatures, and suits.
@@ -575,7 +576,7 @@ class Monitor:
         return Event(cycle.end_ns, Kind.DEVIATION, text, data)
 
     def _rank_causes(
-        self, worst: Outlier, before: Cycle | None, cycle: Cycle, verdict: "Verdict | None"
+        self, worst: Outlier, view: CycleView, verdict: "Verdict | None"
     ) -> Sequence[Likeness]:
         """Rank the causes of a cycle's deviation; the model settles in the cycle before.
 
@@ -594,12 +595,12 @@ class Monitor:
                 Likeness(drift.name, size, shift.unit, LEVELS_ALONE),
                 Likeness(UNKNOWN, None, "", 1.0 - LEVELS_ALONE),
             ]
+        cycle, before, *_, theta = view
         parts = [cycle] if before is None else [before, cycle]
         samples = np.concatenate([part.samples for part in parts])
         ticks = np.concatenate([part.ticks for part in parts])
         begin = len(samples) - len(cycle.samples)
         known_effects = self.isolation.known if self.isolation else ()
-        theta = following(self.theta, samples)
         return likenesses(theta, self.settings.healthy, samples, ticks, begin, known_effects)
 
 

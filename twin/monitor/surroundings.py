@@ -1,11 +1,15 @@
-"""Ambient pressure and temperature by a barometer and a thermometer; only this module follows them.
+"""Ambient pressure and temperature of a stream of rows; only this module follows them.
 
 A data set has their values at the calibration of its unit. Measured values change the model's
 surroundings and nothing else, as the effect ``ambient_pressure`` does. The twin takes them over at
-each suction edge, the monitor at each cycle, a diagnosis once per log.
+each suction edge, the monitor at each cycle, a diagnosis once per log. Twin and monitor also follow
+an absolute sensor in an opened idle, if there is no barometer: at the pace of weather, and no
+faster, since a reading that changes faster is a fault.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +20,31 @@ from twin.model.dataset import DataSet
 from twin.model.theta import Theta
 from twin.monitor.breakpoints import renewed_every
 from twin.quality import UNUSABLE
-from twin.signals import MBAR, ZERO_C, Command, Phase, Samples, Ticks, sampling_ms
+from twin.signals import (
+    MBAR,
+    NS,
+    SAMPLE,
+    ZERO_C,
+    Command,
+    Phase,
+    Samples,
+    Ticks,
+    joined,
+    sampling_ms,
+)
 
 COLUMNS = (("ambient", c.AMBIENT), ("temperature", c.TEMPERATURE))
+# Pa/s, fastest change of ambient pressure by weather. Forecasts for shipping call more than 6 hPa
+# in 3 hours "very rapidly" (Met Office, Marine forecasts glossary); this is twice as fast.
+PACE = 4.0 * MBAR / 3600.0
+# Pa, farthest weather from that of the calibration: 2.7 sigmas of the prior's 15 mbar.
+RANGE = 40.0 * MBAR
+# Pa, by which an idle of a healthy rig may differ from the followed ambient pressure. Commissioning
+# calls a system opened if its idles are within 2 mbar.
+APART = 1.0 * MBAR
+SIGMAS = 4.0  # the same, of the noise of an idle's mean
+STILL = 0.5 * MBAR  # Pa, largest move between the halves of a settled idle's last rows
+REST_ROWS = 40  # these last rows: two periods of the mains in rows 1 ms apart
 
 
 @compiled
@@ -83,15 +109,88 @@ def taken_in(data: DataSet, samples: Samples) -> DataSet:
     return DataSet.model_validate(updated.model_dump())
 
 
-def stretches(samples: Samples, ticks: Ticks, before: int) -> Iterator[tuple[slice, Samples]]:
-    """Slices of rows with constant surroundings, and the row that measured them.
+@dataclass
+class OpenedIdle:
+    """Ambient pressure (Pa) by the readings of an absolute sensor in the idles of an opened system.
 
-    A slice begins at a suction edge, with that row. The first slice continues the surroundings of
-    the rows before, so it has no such row; ``before`` is the phase of the last of these.
+    It follows the changes of the idle as fast as weather can change. What is faster is no weather,
+    and stays so: it is left to the sensor, whatever time passes. Nothing is followed until one idle
+    agrees with the calibration, since the age of that is unknown.
     """
-    phase = np.concatenate([[np.uint8(before)], ticks["phase"]])
-    before_suction = np.isin(phase[:-1], (Phase.IDLE, Phase.BLOW_OFF))
-    edges = np.flatnonzero((phase[1:] == Phase.SUCTION) & before_suction).tolist()
-    for first, last in zip([0, *edges], [*edges, len(samples)], strict=True):
-        if last > first or not edges:
-            yield slice(first, last), samples[first : first + 1] if first in edges else samples[:0]
+
+    calibrated: float
+    ambient: float  # followed
+    _left: float | None = None  # Pa of the reading that are no weather; None: no idle agreed yet
+    _last_ns: int = 0  # time of the last idle
+
+    def take(self, reading: float, noise: float, now_ns: int) -> None:
+        """Follow the next idle: its mean (Pa, less the sensor's known offset) and sigma of that."""
+        apart, left = APART + SIGMAS * noise, self._left
+        if left is None:
+            if abs(reading - self.ambient) <= apart:  # a first idle as the calibration left it
+                self._left = 0.0 if self._last_ns else reading - self.ambient
+            self._last_ns = now_ns
+            return
+        most = PACE * max(now_ns - self._last_ns, 0) * NS
+        moved = self.ambient + min(max(reading - left - self.ambient, -most), most)
+        self.ambient = min(max(moved, self.calibrated - RANGE), self.calibrated + RANGE)
+        if abs(reading - left - self.ambient) > apart:
+            self._left = reading - self.ambient
+        self._last_ns = now_ns
+
+
+class Surroundings:
+    """Coefficients in the surroundings of a stream, taken over at each suction edge.
+
+    With ``idle`` they follow an opened idle, if the sensor is absolute, parts are released, and no
+    barometer is seen.
+    """
+
+    def __init__(self, theta: Theta, *, idle: bool = True) -> None:
+        self._theta = theta
+        self._idle: OpenedIdle | None = None
+        if idle and not theta[c.GAUGE] and math.isfinite(theta[c.RELEASE]):
+            self._idle = OpenedIdle(float(theta[c.AMBIENT]), float(theta[c.AMBIENT]))
+        self._phase: int = Phase.IDLE  # of the newest row
+        self._tail = np.empty(0, SAMPLE)  # the newest rows, if they are idle
+
+    def over(self, samples: Samples, ticks: Ticks) -> list[tuple[slice, Theta]]:
+        """Slices of the next rows, with the coefficients in each."""
+        slices, first = [], 0
+        before = np.concatenate([[np.uint8(self._phase)], ticks["phase"]])
+        if self._idle or are_told(samples):
+            edges = before[1:] == Phase.SUCTION
+            edges &= (before[:-1] == Phase.IDLE) | (before[:-1] == Phase.BLOW_OFF)
+            for edge in np.flatnonzero(edges).tolist():
+                if edge > first:
+                    slices.append((slice(first, edge), self._theta))
+                self._take(samples[edge : edge + 1], self._rest(samples, before, edge))
+                first = edge
+            self._tail = self._rest(samples, before, len(samples)).copy()
+        self._phase = int(before[-1])
+        return [*slices, (slice(first, len(samples)), self._theta)]
+
+    def _rest(self, samples: Samples, before: npt.NDArray[np.uint8], end: int) -> Samples:
+        """The last rows before ``end``, as far as they are idle; ``before`` are phases before."""
+        begin = max(end - REST_ROWS, 0)
+        others = np.flatnonzero(before[begin + 1 : end + 1] != Phase.IDLE)
+        if len(others):
+            return samples[begin + int(others[-1]) + 1 : end]
+        return joined(self._tail, samples[begin:end])[-REST_ROWS:]
+
+    def _take(self, edge: Samples, rest: Samples) -> None:
+        """Take over what the row of a suction edge measures, or the last rows of idle before."""
+        self._theta = following(self._theta, edge)
+        if edge["ambient"][0] > 0.0:
+            self._idle = None
+        if self._idle is None or len(rest) < REST_ROWS or rest["quality"].any():
+            return
+        readings = rest["pressure"].astype(np.float64)
+        halves = readings.reshape(2, -1).mean(axis=1)
+        if not abs(halves[1] - halves[0]) <= STILL:  # or one is NaN
+            return
+        noise = float(readings.std()) / math.sqrt(REST_ROWS)
+        reading = float(readings.mean() - self._theta[c.SENSOR_OFFSET])
+        self._idle.take(reading, noise, int(rest["host_ns"][-1]))
+        self._theta = self._theta.copy()
+        self._theta[c.AMBIENT] = self._idle.ambient
