@@ -208,10 +208,9 @@ def test_an_idle_that_tells_nothing_is_left_out(spoils: str) -> None:
     samples = clears_up().copy()
     idle = samples["commands"] == 0
     if spoils == "rises":
-        since = np.arange(len(samples)) - np.maximum.accumulate(
-            np.where(idle, 0, np.arange(len(samples)))
-        )
-        samples["pressure"][idle] += since[idle].astype("f4") * np.float32(0.05 * MBAR)
+        ends = np.minimum.accumulate(np.where(idle, len(samples), np.arange(len(samples)))[::-1])
+        rest = (ends[::-1] - np.arange(len(samples)))[idle]  # rows to the end of the idle
+        samples["pressure"][idle] -= rest.astype("f4") * np.float32(0.04 * MBAR)
     elif spoils == "short":
         suction = np.flatnonzero(np.diff((samples["commands"] == Command.SUCTION).astype("i1")) > 0)
         for row in suction + 1:
