@@ -153,6 +153,7 @@ def ambient_of_rows(theta: Theta, samples: Samples, size: int = 1_000_000) -> Ho
     """mbar by which ambient pressure is above that of ``theta``, row by row."""
     surroundings, ambient = Surroundings(theta), np.full(len(samples), np.nan)
     for begin in range(0, len(samples), size):
+        surroundings.over(samples[:0], as_commanded(samples[:0]))  # no rows come for a while
         rows = samples[begin : begin + size]
         for part, here in surroundings.over(rows, as_commanded(rows)):
             ambient[begin : begin + len(rows)][part] = here[c.AMBIENT] - theta[c.AMBIENT]

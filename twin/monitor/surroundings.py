@@ -8,6 +8,8 @@ faster, since a reading that changes faster is a fault.
 """
 
 import math
+import re
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -23,7 +25,6 @@ from twin.quality import UNUSABLE
 from twin.signals import (
     MBAR,
     NS,
-    SAMPLE,
     ZERO_C,
     Command,
     Phase,
@@ -45,6 +46,9 @@ APART = 1.0 * MBAR
 SIGMAS = 4.0  # the same, of the noise of an idle's mean
 STILL = 0.5 * MBAR  # Pa, largest move between the halves of a settled idle's last rows
 REST_ROWS = 40  # these last rows: two periods of the mains in rows 1 ms apart
+# Phases as bytes are searched in a microsecond, as NumPy does not in a short block.
+_IDLE = b"%c" % Phase.IDLE
+_BEFORE_SUCTION = re.compile(b"[%c%c](?=%c)" % (Phase.IDLE, Phase.BLOW_OFF, Phase.SUCTION))
 
 
 @compiled
@@ -151,32 +155,40 @@ class Surroundings:
         self._idle: OpenedIdle | None = None
         if idle and not theta[c.GAUGE] and math.isfinite(theta[c.RELEASE]):
             self._idle = OpenedIdle(float(theta[c.AMBIENT]), float(theta[c.AMBIENT]))
-        self._phase: int = Phase.IDLE  # of the newest row
-        self._tail = np.empty(0, SAMPLE)  # the newest rows, if they are idle
+        self._phase = _IDLE  # of the newest row
+        self._tail = deque[Samples]()  # the newest rows in parts, if they are idle
 
     def over(self, samples: Samples, ticks: Ticks) -> list[tuple[slice, Theta]]:
         """Slices of the next rows, with the coefficients in each."""
         slices, first = [], 0
-        before = np.concatenate([[np.uint8(self._phase)], ticks["phase"]])
+        phases = self._phase + ticks["phase"].tobytes()  # of the row before, and of these
         if self._idle or are_told(samples):
-            edges = before[1:] == Phase.SUCTION
-            edges &= (before[:-1] == Phase.IDLE) | (before[:-1] == Phase.BLOW_OFF)
-            for edge in np.flatnonzero(edges).tolist():
+            for found in _BEFORE_SUCTION.finditer(phases):
+                edge = found.start()
                 if edge > first:
                     slices.append((slice(first, edge), self._theta))
-                self._take(samples[edge : edge + 1], self._rest(samples, before, edge))
+                self._take(samples[edge : edge + 1], self._rest(samples, phases, edge))
                 first = edge
-            self._tail = self._rest(samples, before, len(samples)).copy()
-        self._phase = int(before[-1])
+            self._keep(samples, len(phases.rstrip(_IDLE)) - 1)
+        self._phase = phases[-1:]
         return [*slices, (slice(first, len(samples)), self._theta)]
 
-    def _rest(self, samples: Samples, before: npt.NDArray[np.uint8], end: int) -> Samples:
-        """The last rows before ``end``, as far as they are idle; ``before`` are phases before."""
-        begin = max(end - REST_ROWS, 0)
-        others = np.flatnonzero(before[begin + 1 : end + 1] != Phase.IDLE)
-        if len(others):
-            return samples[begin + int(others[-1]) + 1 : end]
-        return joined(self._tail, samples[begin:end])[-REST_ROWS:]
+    def _rest(self, samples: Samples, phases: bytes, edge: int) -> Samples:
+        """The last rows of idle before an edge; none if they are too few."""
+        first = max(edge - REST_ROWS, 0)
+        if phases.count(_IDLE, first + 1, edge + 1) < edge - first:
+            return samples[:0]
+        rest = samples[first:edge]
+        return rest if edge >= REST_ROWS else joined(*self._tail, rest)[-REST_ROWS:]
+
+    def _keep(self, samples: Samples, first: int) -> None:
+        """Keep the newest rows: those from ``first`` on are idle, all of them at −1."""
+        if first >= 0:
+            self._tail.clear()
+        if max(first, 0) < len(samples):
+            self._tail.append(samples[max(first, 0) :])
+            while sum(map(len, self._tail)) - len(self._tail[0]) >= REST_ROWS:
+                self._tail.popleft()
 
     def _take(self, edge: Samples, rest: Samples) -> None:
         """Take over what the row of a suction edge measures, or the last rows of idle before."""
