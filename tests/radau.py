@@ -47,6 +47,14 @@ class Valves:
     open: float | None = None
 
 
+def driving(p: float, behind: float, critical: float) -> float:
+    """What drives a flow from ``p`` to ``behind`` (Pa²), by ISO 6358; negative the other way."""
+    if p < behind:
+        return -driving(behind, p, critical)
+    ratio = max(behind / p - critical, 0.0) / (1.0 - critical)
+    return (1.0 - critical) * p**2 * (1.0 - ratio**2)
+
+
 def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
     def peak(at: float) -> float:
         off = at / theta[c.SUPPLY_OPTIMUM] - 1.0
@@ -108,7 +116,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     """d/dt of three pressures, three masses, two flows, and of what a row has behind these."""
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
     yielded, drive, jet, valve, drained, supply, felt, sensed = y[8:]
-    ambient, outside = theta[c.AMBIENT], theta[c.TEMPERATURE]
+    ambient, outside, critical = theta[[c.AMBIENT, c.TEMPERATURE, c.LINE_CRITICAL]]
     shrunk, stretch = shrinkage(theta, vessel)
     at_once = 1.0 - theta[c.CREEP]
     volume = theta[c.VOLUME] - at_once * shrunk - yielded
@@ -119,7 +127,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
 
     stiff = theta[c.NEAR_INERTANCE] == 0.0  # then port and line are one node, and far is friction
     if stiff:
-        difference = vessel**2 - port**2
+        difference = driving(vessel, port, critical)
         warm = (vessel_t if difference >= 0.0 else line_t) / outside
         linear, quadratic = warm * theta[c.LAMINAR], warm * theta[c.RESISTANCE]
         root = np.sqrt(linear**2 + 4.0 * quadratic * abs(difference))
@@ -163,9 +171,12 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     if not stiff:
         rub = (theta[c.NEAR_RESISTANCE] * abs(near) + theta[c.NEAR_LAMINAR]) * near
         rub *= near_t / outside
-        near_push = (line**2 - port**2 - rub) / (theta[c.NEAR_INERTANCE] * (line + port))
+        near_push = (driving(line, port, critical) - rub) / (
+            theta[c.NEAR_INERTANCE] * (line + port)
+        )
         rub = (theta[c.RESISTANCE] * abs(far) + theta[c.LAMINAR]) * far * far_t / outside
-        pushes = near_push, (vessel**2 - line**2 - rub) / (theta[c.INERTANCE] * (vessel + line))
+        far_push = (driving(vessel, line, critical) - rub) / (theta[c.INERTANCE] * (vessel + line))
+        pushes = near_push, far_push
     return np.array(
         [
             (GAMMA - 1.0) * port_gain / theta[c.PORT_VOLUME],

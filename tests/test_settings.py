@@ -278,7 +278,8 @@ def test_every_coefficient_is_filled_in() -> None:
     cups = {"COMPLIANCE", "SOFTNESS", "STIFF_UNTIL", "CREEP", "CONTACT"}
     mechanisms = set(list(COEFFICIENTS)[MECHANISMS:])
     blow_off = {"BLOW_OFF_SHAPE", "BLOW_OFF_DRAIN"}
-    assert zero == blow_off | cups | opening | convection | effects | modes | mechanisms
+    line = {"LINE_CRITICAL"}
+    assert zero == line | blow_off | cups | opening | convection | effects | modes | mechanisms
 
 
 def test_each_coefficient_has_the_number_of_its_row() -> None:

@@ -23,7 +23,7 @@ enum { /* twin.model.theta.COEFFICIENTS */
     RELIEF_PRESSURE, EXHAUST, CRACKING_PRESSURE, PORT_VOLUME, PORT_HEAT, LINE_VOLUME, LINE_HEAT,
     VOLUME, COMPLIANCE, SOFTNESS, STIFF_UNTIL, CREEP, CREEP_TIME, FILM, FREE_CONVECTION,
     FORCED_CONVECTION, AREA, NEAR_RESISTANCE, NEAR_LAMINAR, NEAR_INERTANCE,
-    RESISTANCE, LAMINAR, INERTANCE, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, PORT_INFLOW, BACK_FLOW,
+    RESISTANCE, LAMINAR, INERTANCE, LINE_CRITICAL, PLACE, LEAK, LEAK_CRITICAL, LAMINAR_LEAK, INFLOW, PORT_INFLOW, BACK_FLOW,
     OPENING, HOLE, SENSOR_LAG, SLOW_SENSOR, SENSOR_OFFSET, GAUGE, SENSOR_GAIN, H1, H1_LOW, H1_FOLLOWS, H2, H2_LOW,
     RELEASE, CONTACT, CONTROL_SENSOR, AIR_SAVING, PERMITTED_LEAKAGE, BLOW_OFF_MODE,
     BLOW_OFF_TIME, COEFFICIENTS
@@ -199,14 +199,41 @@ INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
 }
 
 INLINED double through(double rest, double fall, double before, double rise,
-                             double quadratic, double linear, double pushed)
+                             double quadratic, double linear, double pushed, double critical)
 {
-    double difference = rest * rest - before * before + pushed;
-    double friction = difference >= 0.0 ? quadratic : -quadratic;
-    double square = fall * fall - rise * rise - friction;
-    double slope = 2.0 * (rest * fall + before * rise) + linear;
+    double apart = rest - before, both = fall + rise;
+    int onward = pushed * both * both <= (linear * both + quadratic * fabs(apart)) * apart;
+    double high = onward ? rest : before, drops = onward ? fall : rise;
+    double low = onward ? before : rest, gains = onward ? rise : fall;
+    double push = onward ? pushed : -pushed;
+    double excess = critical * high - low, steep = gains + critical * drops;
+    double there = high * steep - drops * excess;
+    double driven = (1.0 - critical) * there * there + push * steep * steep;
+    double resisted = (linear * steep + quadratic * fabs(excess)) * excess;
+    int choked = driven < resisted;
+    low = choked ? critical * high : low;
+    gains = choked ? -critical * drops : gains;
+    apart = high - low;
+    both = drops + gains;
+    double bend = critical / (1.0 - critical);
+    double difference = high * high - low * low + push - bend * apart * apart;
+    int positive = (difference >= 0.0) | ((excess > 0.0) & (driven >= resisted));
+    double friction = positive ? quadratic : -quadratic;
+    double square = drops * drops - gains * gains - friction - bend * both * both;
+    double slope = 2.0 * (high * drops + low * gains - bend * apart * both) + linear;
     double root = sqrt(max(slope * slope - 4.0 * square * difference, 0.0));
-    return 2.0 * difference / (slope + root);
+    double above = slope > 0.0 ? 2.0 * difference : slope - root;
+    double below = slope > 0.0 ? slope + root : 2.0 * square;
+    double flow = above / below;
+    return onward ? flow : -flow;
+}
+
+typedef struct { double first, second; } Slopes;
+
+INLINED Slopes slopes(double first, double second, double critical)
+{
+    double lost = critical * min(fabs(first - second) / (1.0 - critical), max(first, second));
+    return (Slopes){max(first - lost, 0.0), max(second - lost, 0.0)};
 }
 
 INLINED double kept(double mass, double work)
@@ -296,12 +323,13 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     double warm = near_t * per_k;
     double quadratic = warm * K(NEAR_RESISTANCE), linear = warm * K(NEAR_LAMINAR) + inertia;
     double pushed = inertia * known->near;
-    double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed);
-    double slope =
-        2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * fabs(near)) + linear;
-    double near_slope = 2.0 * y.line / slope;
+    double critical = K(LINE_CRITICAL);
+    double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed, critical);
+    Slopes of = slopes(y.line, port_rest + port_rise * near, critical);
+    double slope = 2.0 * (port_rise * of.second + quadratic * fabs(near)) + linear;
+    double near_slope = 2.0 * of.first / slope;
     near -= near_slope * y.line;
-    weight = slope / (slope + 2.0 * y.line * line_fall);
+    weight = slope / (slope + 2.0 * of.first * line_fall);
     line_rest = (line_rest - line_fall * near) * weight;
     line_rise = line_rise * weight;
 
@@ -310,7 +338,8 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     quadratic = warm * K(RESISTANCE);
     linear = warm * K(LAMINAR) + inertia;
     pushed = inertia * known->far;
-    double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed);
+    double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed,
+                         critical);
 
     double line = min(max(line_rest + line_rise * far, LOWEST), HIGHEST);
     double vessel = min(max(vessel_rest - vessel_fall * far, LOWEST), HIGHEST);

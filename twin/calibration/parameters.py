@@ -163,6 +163,8 @@ FREE_IN_MARKET = (
     Free("supply", "droop_bar", "bar", 0.1, 0.0, 1.0, market=1.0),
     Free("supply", "lag_ms", "ms", 20.0, 1.0, 1000.0, market=1.0),
     Free("system", "leak_critical_ratio", "", 0.05, 0.1, 0.6, market=0.12, scaled=False),
+    # Catalogues of tubes and fittings have 0.1 to 0.5, less the longer a tube is.
+    Free("system", "line_critical_ratio", "", 0.05, 0.0, 0.5, market=0.15, scaled=False),
     Free("system", "opening_factor", "", 0.4, 1e-3, 100.0, True, market=1.5),
     Free("system", "line_volume_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
     Free("system", "line_inertia_factor", "", 0.2, 0.02, 50.0, True, market=0.5),
