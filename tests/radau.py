@@ -48,11 +48,17 @@ class Valves:
 
 
 def driving(p: float, behind: float, critical: float) -> float:
-    """What drives a flow from ``p`` to ``behind`` (Pa²), by ISO 6358; negative the other way."""
-    if p < behind:
-        return -driving(behind, p, critical)
+    """The square of a flow from ``p`` to ``behind`` times its friction (Pa²), by ISO 6358."""
     ratio = max(behind / p - critical, 0.0) / (1.0 - critical)
-    return (1.0 - critical) * p**2 * (1.0 - ratio**2)
+    return float((1.0 - critical) * p**2 * (1.0 - ratio**2))
+
+
+def choking(port: float, vessel: float, critical: float) -> float:
+    """How many times the friction counts with which isothermal pipe flow is that of ISO 6358."""
+    low, high = sorted((port, vessel))
+    nearly = high * (1.0 - 1e-9)  # without a drop it is 1
+    low = min(low, nearly)
+    return (high**2 - low**2) / driving(high, low, critical)
 
 
 def suction_flow(theta: Theta, p: float, jet: float, supply: float) -> float:
@@ -117,6 +123,7 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     port, line, vessel, port_mass, line_mass, vessel_mass, near, far = y[:8]
     yielded, drive, jet, valve, drained, supply, felt, sensed = y[8:]
     ambient, outside, critical = theta[[c.AMBIENT, c.TEMPERATURE, c.LINE_CRITICAL]]
+    chokes = choking(port, vessel, critical)
     shrunk, stretch = shrinkage(theta, vessel)
     at_once = 1.0 - theta[c.CREEP]
     volume = theta[c.VOLUME] - at_once * shrunk - yielded
@@ -127,9 +134,9 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
 
     stiff = theta[c.NEAR_INERTANCE] == 0.0  # then port and line are one node, and far is friction
     if stiff:
-        difference = driving(vessel, port, critical)
+        difference = vessel**2 - port**2
         warm = (vessel_t if difference >= 0.0 else line_t) / outside
-        linear, quadratic = warm * theta[c.LAMINAR], warm * theta[c.RESISTANCE]
+        linear, quadratic = warm * theta[c.LAMINAR], warm * theta[c.RESISTANCE] * chokes
         root = np.sqrt(linear**2 + 4.0 * quadratic * abs(difference))
         far = 2.0 * difference / (linear + root)
 
@@ -169,14 +176,11 @@ def rates(_t: float, y: Floats, theta: Theta, valves: Valves) -> Floats:
     there = port + place * (vessel - port)
     pushes = (0.0, 0.0)
     if not stiff:
-        rub = (theta[c.NEAR_RESISTANCE] * abs(near) + theta[c.NEAR_LAMINAR]) * near
+        rub = (theta[c.NEAR_RESISTANCE] * chokes * abs(near) + theta[c.NEAR_LAMINAR]) * near
         rub *= near_t / outside
-        near_push = (driving(line, port, critical) - rub) / (
-            theta[c.NEAR_INERTANCE] * (line + port)
-        )
-        rub = (theta[c.RESISTANCE] * abs(far) + theta[c.LAMINAR]) * far * far_t / outside
-        far_push = (driving(vessel, line, critical) - rub) / (theta[c.INERTANCE] * (vessel + line))
-        pushes = near_push, far_push
+        near_push = (line**2 - port**2 - rub) / (theta[c.NEAR_INERTANCE] * (line + port))
+        rub = (theta[c.RESISTANCE] * chokes * abs(far) + theta[c.LAMINAR]) * far * far_t / outside
+        pushes = near_push, (vessel**2 - line**2 - rub) / (theta[c.INERTANCE] * (vessel + line))
     return np.array(
         [
             (GAMMA - 1.0) * port_gain / theta[c.PORT_VOLUME],

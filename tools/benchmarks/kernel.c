@@ -199,41 +199,23 @@ INLINED Tangent at_vessel(double p, const Driven *driven, const double *k)
 }
 
 INLINED double through(double rest, double fall, double before, double rise,
-                             double quadratic, double linear, double pushed, double critical)
+                             double quadratic, double linear, double pushed)
 {
-    double apart = rest - before, both = fall + rise;
-    int onward = pushed * both * both <= (linear * both + quadratic * fabs(apart)) * apart;
-    double high = onward ? rest : before, drops = onward ? fall : rise;
-    double low = onward ? before : rest, gains = onward ? rise : fall;
-    double push = onward ? pushed : -pushed;
-    double excess = critical * high - low, steep = gains + critical * drops;
-    double there = high * steep - drops * excess;
-    double driven = (1.0 - critical) * there * there + push * steep * steep;
-    double resisted = (linear * steep + quadratic * fabs(excess)) * excess;
-    int choked = driven < resisted;
-    low = choked ? critical * high : low;
-    gains = choked ? -critical * drops : gains;
-    apart = high - low;
-    both = drops + gains;
-    double bend = critical / (1.0 - critical);
-    double difference = high * high - low * low + push - bend * apart * apart;
-    int positive = (difference >= 0.0) | ((excess > 0.0) & (driven >= resisted));
-    double friction = positive ? quadratic : -quadratic;
-    double square = drops * drops - gains * gains - friction - bend * both * both;
-    double slope = 2.0 * (high * drops + low * gains - bend * apart * both) + linear;
+    double difference = rest * rest - before * before + pushed;
+    double friction = difference >= 0.0 ? quadratic : -quadratic;
+    double square = fall * fall - rise * rise - friction;
+    double slope = 2.0 * (rest * fall + before * rise) + linear;
     double root = sqrt(max(slope * slope - 4.0 * square * difference, 0.0));
-    double above = slope > 0.0 ? 2.0 * difference : slope - root;
-    double below = slope > 0.0 ? slope + root : 2.0 * square;
-    double flow = above / below;
-    return onward ? flow : -flow;
+    return 2.0 * difference / (slope + root);
 }
 
-typedef struct { double first, second; } Slopes;
-
-INLINED Slopes slopes(double first, double second, double critical)
+INLINED double choking(double port, double vessel, double critical)
 {
-    double lost = critical * min(fabs(first - second) / (1.0 - critical), max(first, second));
-    return (Slopes){max(first - lost, 0.0), max(second - lost, 0.0)};
+    double high = max(port, vessel), low = min(port, vessel);
+    double least = max(low, critical * high);
+    double both = high + least, most = (1.0 - critical * critical) * high * high;
+    double bent = (1.0 - critical) * both - critical * (high - least);
+    return (1.0 - critical) * both * (most + (least * least - low * low)) / (bent * most);
 }
 
 INLINED double kept(double mass, double work)
@@ -319,27 +301,26 @@ INLINED Gas solve(Gas y, const Gas *known, double step, const Driven *driven, co
     gained += creeping * y.vessel + GAMMA * y.vessel * yields * per_pa;
     double vessel_rest = gained * weight, vessel_fall = far_t * weight;
 
+    double chokes = choking(y.port, y.vessel, K(LINE_CRITICAL));
     double inertia = K(NEAR_INERTANCE) * (y.line + y.port) * per_s;
     double warm = near_t * per_k;
-    double quadratic = warm * K(NEAR_RESISTANCE), linear = warm * K(NEAR_LAMINAR) + inertia;
+    double quadratic = warm * K(NEAR_RESISTANCE) * chokes, linear = warm * K(NEAR_LAMINAR) + inertia;
     double pushed = inertia * known->near;
-    double critical = K(LINE_CRITICAL);
-    double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed, critical);
-    Slopes of = slopes(y.line, port_rest + port_rise * near, critical);
-    double slope = 2.0 * (port_rise * of.second + quadratic * fabs(near)) + linear;
-    double near_slope = 2.0 * of.first / slope;
+    double near = through(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed);
+    double slope =
+        2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * fabs(near)) + linear;
+    double near_slope = 2.0 * y.line / slope;
     near -= near_slope * y.line;
-    weight = slope / (slope + 2.0 * of.first * line_fall);
+    weight = slope / (slope + 2.0 * y.line * line_fall);
     line_rest = (line_rest - line_fall * near) * weight;
     line_rise = line_rise * weight;
 
     inertia = K(INERTANCE) * (y.vessel + y.line) * per_s;
     warm = far_t * per_k;
-    quadratic = warm * K(RESISTANCE);
+    quadratic = warm * K(RESISTANCE) * chokes;
     linear = warm * K(LAMINAR) + inertia;
     pushed = inertia * known->far;
-    double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed,
-                         critical);
+    double far = through(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed);
 
     double line = min(max(line_rest + line_rise * far, LOWEST), HIGHEST);
     double vessel = min(max(vessel_rest - vessel_fall * far, LOWEST), HIGHEST);

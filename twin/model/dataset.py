@@ -452,7 +452,7 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
         theta[line] = (1.0 - near) * value * system.line_factor
     theta[c.NEAR_RESISTANCE] = near * total.resistance * system.line_factor
     theta[c.NEAR_LAMINAR] = near * total.laminar * system.line_factor
-    theta[c.LINE_CRITICAL] = _critical_of_each(system.line_critical_ratio, near)
+    theta[c.LINE_CRITICAL] = system.line_critical_ratio
     place = min(max(total.place + system.sensor_shift, 0.0), 1.0)
     theta[c.PLACE] = place * total.resistance * system.line_factor
     theta[c.LEAK_CRITICAL] = system.leak_critical_ratio
@@ -464,16 +464,6 @@ def _set_system(theta: Theta, system: System, ejector_volume: float) -> None:
     release = total.release + system.release_shift_mbar * MBAR
     theta[c.RELEASE] = AFTER_BLOW_OFF if late else release
     theta[c.CONTACT] = system.part_meets_ms * MS
-
-
-def _critical_of_each(critical: float, near: float) -> float:
-    """Critical ratio of two resistances in series that are together as one with ``critical``.
-
-    ``near`` is the share of the first one. What the critical ratio b takes from the square of the
-    flow, b/(1 − b) times the square of a pressure drop, is the same while neither is choked.
-    """
-    bend = critical / (1.0 - critical) / (near * near + (1.0 - near) * (1.0 - near))
-    return bend / (1.0 + bend)
 
 
 def sensor_place(data: DataSet) -> float:

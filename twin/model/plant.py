@@ -299,56 +299,34 @@ def line_flow(
     quadratic: float,
     linear: float,
     pushed: float,
-    critical: float,
 ) -> float:
     """Flow w (kg/s) through a line between two pressures that are linear in w.
 
-    The pressures are ``rest − fall w`` and ``before + rise w``. K is ``quadratic`` and L is
-    ``linear``; both grow with temperature. Inertia adds (p₁ + p₂) I / step to L; the same times the
-    flow before is ``pushed``. With the ``critical`` pressure ratio b, from 0 to below 1,
-
-    p₁² − p₂² − b/(1 − b) (p₁ − p₂)² = K w |w| + L w − pushed, with p₂ at least b p₁,
-
-    where p₁ is the higher pressure. Without L this is ISO 6358 with the sonic conductance
-    √((1 − b)/K); with b = 0, isothermal pipe flow. b changes nothing at a small drop of pressure.
+    The pressures are ``rest − fall w`` and ``before + rise w``. Isothermal pipe flow with inertia:
+    p₁² − p₂² = K w |w| + L w − pushed. K is ``quadratic`` and L is ``linear``; both grow with
+    temperature. Inertia adds (p₁ + p₂) I / step to L; the same times the flow before is ``pushed``.
     """
-    # Which pressure is the higher one depends on whether w is above the flow that makes them equal.
-    apart, both = rest - before, fall + rise
-    is_onward = pushed * both * both <= (linear * both + quadratic * abs(apart)) * apart
-    high, drops = (rest, fall) if is_onward else (before, rise)
-    low, gains = (before, rise) if is_onward else (rest, fall)
-    push = pushed if is_onward else -pushed
-    # It chokes if w is below the flow at which low = b high; that is excess / steep.
-    excess, steep = critical * high - low, gains + critical * drops
-    there = high * steep - drops * excess
-    driven = (1.0 - critical) * there * there + push * steep * steep
-    resisted = (linear * steep + quadratic * abs(excess)) * excess
-    is_choked = driven < resisted
-    low = critical * high if is_choked else low
-    gains = -critical * drops if is_choked else gains
-    apart, both = high - low, drops + gains
-    bend = critical / (1.0 - critical)
-    difference = high * high - low * low + push - bend * apart * apart
-    is_positive = (difference >= 0.0) | ((excess > 0.0) & (driven >= resisted))
-    friction = quadratic if is_positive else -quadratic
-    square = drops * drops - gains * gains - friction - bend * both * both
-    slope = 2.0 * (high * drops + low * gains - bend * apart * both) + linear
+    difference = rest * rest - before * before + pushed
+    friction = quadratic if difference >= 0.0 else -quadratic
+    square = fall * fall - rise * rise - friction
+    slope = 2.0 * (rest * fall + before * rise) + linear
     root = math.sqrt(max(slope * slope - 4.0 * square * difference, 0.0))
-    # Two forms of one root: each is exact where the other one is a small difference.
-    above, below = (2.0 * difference, slope + root) if slope > 0.0 else (slope - root, 2.0 * square)
-    flow = above / below
-    return flow if is_onward else -flow
+    return 2.0 * difference / (slope + root)
 
 
 @inlined
-def line_slopes(first: float, second: float, critical: float) -> tuple[float, float]:
-    """Halves of the slopes of what drives a line's flow, over its pressures (Pa), as positive.
+def choking(port: float, vessel: float, critical: float) -> float:
+    """How many times the quadratic friction of the line counts between these pressures (Pa).
 
-    What drives it is the left side of the equation of ``line_flow``. Of a line that chokes, the
-    slope over the lower pressure is 0.
+    With it, isothermal pipe flow p₁² − p₂² = K w² becomes ISO 6358 with the ``critical`` pressure
+    ratio b (0 to below 1) and the sonic conductance √((1 − b)/K). It is 1 where the pressures are
+    equal, 1 + b where the line begins to choke, and at most 1/(1 − b); with b = 0 it is 1.
     """
-    lost = critical * min(abs(first - second) / (1.0 - critical), max(first, second))
-    return max(first - lost, 0.0), max(second - lost, 0.0)
+    high, low = max(port, vessel), min(port, vessel)
+    least = max(low, critical * high)  # what lies below does not move the flow
+    both, most = high + least, (1.0 - critical * critical) * high * high
+    bent = (1.0 - critical) * both - critical * (high - least)
+    return (1.0 - critical) * both * (most + (least * least - low * low)) / (bent * most)
 
 
 @inlined
@@ -482,26 +460,25 @@ def solve(y: Gas, base: Gas, step: float, driven: Driven, k: Prepared, i: int) -
     gained += creeping * y.vessel + yields * per_pa
     vessel_rest, vessel_fall = gained * weight, far_t * weight
 
+    chokes = choking(y.port, y.vessel, k[c.LINE_CRITICAL, i])
     inertia = k[c.NEAR_INERTANCE, i] * (y.line + y.port) * per_s
     warm = near_t * per_k
-    quadratic, linear = warm * k[c.NEAR_RESISTANCE, i], warm * k[c.NEAR_LAMINAR, i] + inertia
+    quadratic = warm * k[c.NEAR_RESISTANCE, i] * chokes
+    linear = warm * k[c.NEAR_LAMINAR, i] + inertia
     pushed = inertia * base.near
-    critical = k[c.LINE_CRITICAL, i]
-    near = line_flow(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed, critical)
-    before, after = line_slopes(y.line, port_rest + port_rise * near, critical)
-    slope = 2.0 * (port_rise * after + quadratic * abs(near)) + linear
-    near_slope = 2.0 * before / slope
+    near = line_flow(y.line, 0.0, port_rest, port_rise, quadratic, linear, pushed)
+    slope = 2.0 * (port_rise * (port_rest + port_rise * near) + quadratic * abs(near)) + linear
+    near_slope = 2.0 * y.line / slope
     near -= near_slope * y.line
-    weight = slope / (slope + 2.0 * before * line_fall)
+    weight = slope / (slope + 2.0 * y.line * line_fall)
     line_rest, line_rise = (line_rest - line_fall * near) * weight, line_rise * weight
 
     inertia = k[c.INERTANCE, i] * (y.vessel + y.line) * per_s
     warm = far_t * per_k
-    quadratic, linear = warm * k[c.RESISTANCE, i], warm * k[c.LAMINAR, i] + inertia
+    quadratic = warm * k[c.RESISTANCE, i] * chokes
+    linear = warm * k[c.LAMINAR, i] + inertia
     pushed = inertia * base.far
-    far = line_flow(
-        vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed, critical
-    )
+    far = line_flow(vessel_rest, vessel_fall, line_rest, line_rise, quadratic, linear, pushed)
 
     line = min(max(line_rest + line_rise * far, LOWEST), HIGHEST)
     vessel = min(max(vessel_rest - vessel_fall * far, LOWEST), HIGHEST)

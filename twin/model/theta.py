@@ -102,7 +102,7 @@ COEFFICIENTS: Mapping[str, tuple[str, str]] = {
     "RESISTANCE": ("Pa²/(kg/s)²", "line to vessel: what grows with the square of the flow"),
     "LAMINAR": ("Pa²/(kg/s)", "line to vessel: what grows with the flow"),
     "INERTANCE": ("1/m", "line to vessel: length over bore"),
-    "LINE_CRITICAL": ("1", "pressure ratio up to which the flow through each of the two is sonic"),
+    "LINE_CRITICAL": ("1", "pressure ratio from end to end up to which their flow is sonic"),
     "PLACE": ("Pa²/(kg/s)²", "what of the resistance lies between port and sensor"),
     "LEAK": ("kg/s", "sonic, opening to ambient"),
     "LEAK_CRITICAL": ("1", "pressure ratio up to which that is sonic"),
