@@ -1,4 +1,4 @@
-"""A line that chokes, hidden in a record by the plain equations: the fit finds how it does."""
+"""A line that chokes, hidden in a record by the plain equations: a commissioning finds how."""
 
 from functools import cache
 
@@ -7,15 +7,15 @@ import pytest
 import radau
 from radau import Valves
 
-from twin.calibration.fit import Fitted, fit
-from twin.calibration.parameters import FREE_IN_MARKET, Space
+from twin.calibration.fit import Fitted, fit_from_afar
+from twin.calibration.parameters import FREE_IN_MARKET
 from twin.model import kernel
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.signals import MBAR, MS, SAMPLE, Command, Samples
 
 CRITICAL = "system.line_critical_ratio"
-TRUE, TYPICAL = 0.35, 0.15
+TRUE, TYPICAL = 0.35, 0.0
 CYCLES, NOISE = 4, 0.3 * MBAR
 SUCTION, HOLD, BLOW_OFF, IDLE, END = 100, 700, 750, 1000, 1300  # ms, begins of phases
 
@@ -59,7 +59,7 @@ def recorded(diameter_mm: float) -> tuple[Samples, float]:
 @cache
 def fitted(diameter_mm: float) -> Fitted:
     guess = data_of(diameter_mm, TYPICAL)
-    return fit(recorded(diameter_mm)[0], Space.of_market(guess), lambda _: None)
+    return fit_from_afar(recorded(diameter_mm)[0], [guess], lambda _: None)
 
 
 @pytest.mark.slow
