@@ -12,7 +12,7 @@ import rigs
 from twin.config import Config
 from twin.diagnosis.answer import diagnose
 from twin.diagnosis.evidence import HEALTHY, Evidence, collect
-from twin.diagnosis.experiments import beside_weather
+from twin.diagnosis.experiments import MOSTLY, beside_weather
 from twin.diagnosis.hypotheses import often, price
 from twin.diagnosis.linear_screening import columns, linear_gains, signatures
 from twin.diagnosis.residual_covariance import covariance
@@ -171,6 +171,8 @@ def test_a_log_that_weather_alone_may_explain_asks_for_a_barometer() -> None:
     sentence = beside_weather(evidence, covariance(evidence))
     assert sentence is not None
     assert "record ambient pressure as well: " in sentence
+    assert beside_weather(evidence, covariance(evidence), share=MOSTLY) == sentence
+    assert beside_weather(evidence, covariance(evidence), share=2.0) is None
     told = replace(evidence, told=BOTH)
     assert beside_weather(told, covariance(told)) is None
     assert beside_weather(collected(), covariance(collected())) is None
