@@ -162,7 +162,7 @@ class Surroundings:
         """Slices of the next rows, with the coefficients in each."""
         slices, first = [], 0
         phases = self._phase + ticks["phase"].tobytes()  # of the row before, and of these
-        if self._idle or are_told(samples):
+        if are_told(samples) or self._idle:  # asked first, so that it is compiled with the twin
             for found in _BEFORE_SUCTION.finditer(phases):
                 edge = found.start()
                 if edge > first:
