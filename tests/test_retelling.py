@@ -145,6 +145,18 @@ def test_what_shows_more_of_something_unlisted_is_german(phase: str) -> None:
     assert not ENGLISH_WORDS.search(in_german(sentence))
 
 
+@pytest.mark.parametrize(("mechanism", "asks"), [(None, True), (object(), False)])
+def test_only_what_no_mechanism_explains_asks_for_more_of_it(
+    monkeypatch: pytest.MonkeyPatch, mechanism: object, asks: bool
+) -> None:
+    monkeypatch.setattr(answer, "next_experiment", lambda *_: None)  # there are no rivals
+    monkeypatch.setattr(answer, "beside_weather", lambda *_: None)
+    unlisted = {"verdict": "unlisted", "causes": (), "searched": None, "mechanism": mechanism}
+    findings: Any = SimpleNamespace(**unlisted, strange=SimpleNamespace(where="hold"))
+    nothing: Any = None
+    assert bool(answer._next_experiment(nothing, findings, nothing)) == asks
+
+
 @pytest.mark.parametrize("over", ["time", "vacuum", None])
 def test_the_shape_of_something_unlisted_is_german(over: Any) -> None:
     terms = (Term(where="hold", over=over, at=(0.0, 30.0), mbar=(1.0, 2.5)),) if over else ()

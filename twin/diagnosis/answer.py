@@ -264,8 +264,9 @@ def _with_unlisted(
 
 
 def _next_experiment(evidence: Evidence, findings: _Findings, healthy: Covariance) -> str | None:
-    """What to record or measure next; None if one cause alone explains the log."""
-    if recording := next_experiment(evidence, findings.searched, findings.mechanism):
+    """What to record or measure next; None if a cause or a mechanism alone explains the log."""
+    recording = next_experiment(evidence, findings.searched, findings.mechanism)
+    if recording or findings.mechanism:
         return recording
     about = findings.searched.known if findings.causes else healthy
     weather = beside_weather(evidence, about, findings.causes, MOSTLY)
