@@ -8,6 +8,8 @@ import pytest
 import rigs
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nozzle_found import Score, scored
+from second_world import draw_rig, record
 
 from drivers.plc.faults import parse_fault
 from drivers.plc.settings import PlcSettings
@@ -16,7 +18,7 @@ from tools.calibration_coverage import drawn
 from twin.model import theta as c
 from twin.model.dataset import DataSet, coefficients
 from twin.model.effects import apply
-from twin.monitor import simulated_switching
+from twin.monitor import detector_window, simulated_switching
 from twin.monitor.detector_window import (
     LONGEST_WINDOW,
     detector_of,
@@ -30,7 +32,7 @@ from twin.monitor.switching_detector import (
     PhaseFinder,
 )
 from twin.quality import BREAK, Quality
-from twin.signals import MBAR, MS, SAMPLE, Command, Phase, Samples, sampling_ms
+from twin.signals import MBAR, MS, NS, SAMPLE, Command, Phase, Samples, sampling_ms
 
 NEAR = 20  # rows between a switch and where it is found, lag of sensor and jet included
 SECONDS = 24.0
@@ -407,6 +409,47 @@ def test_a_nozzle_that_switches_every_40_ms_is_followed_live(
     assert max(map(abs, late)) <= 5
     with pytest.raises(AssertionError):  # lines of other grippers ring for longer
         found_where_true(samples, truth, replace(detector, again=rigs.detector("gripper").again))
+
+
+def on_a_long_hose() -> DataSet:
+    """The data set of a rig of the second world with a hose of 2.1 m and 12 mm."""
+    ejector = {"suction_capacity_sl_min": 51.0, "end_pressure_mbar": 285.5, "bulge": -0.3}
+    ejector |= {"skew": 2.3, "bend_2": -2.5, "bend_3": 1.1, "kink": 0.39, "kink_at": 0.11}
+    ejector |= {"port_volume_ml": 14.3, "h1_mbar": 602.0, "h2_mbar": 452.0}
+    ejector |= {"response_ms": 8.7, "response_off_ms": 12.0, "ramp_up_ms": 1.5, "ramp_down_ms": 6.7}
+    hose = {"kind": "tube", "length_mm": 1000.0, "diameter_mm": 12.4}
+    parts = [{"kind": "sensor"}, hose, {"kind": "vessel", "volume_ml": 653.0}]
+    factors = {"line_factor": 2.2, "line_volume_factor": 1.9, "line_inertia_factor": 2.0}
+    return DataSet.model_validate(
+        {
+            "ejector": ejector,
+            "sensor": {"lag_ms": 3.1, "noise_mbar": 0.06},
+            "system": {"parts": parts, **factors, "line_share": 0.5, "shrinks_ml": 34.0},
+        }
+    )
+
+
+def test_a_hose_that_rings_as_suction_begins_is_no_switching(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    logged = record(draw_rig(208_000), 5, 4)
+
+    def scores() -> Score:
+        def live(samples: Samples, _: object) -> list[tuple[float, bool]]:
+            rows, phase, _ = find(samples, detector)
+            at = (rows["time_ns"] - rows["time_ns"][0]) * NS
+            switched = switches(phase == Phase.SUCTION, np.isin(phase, (Phase.SUCTION, Phase.HOLD)))
+            return [(float(at[row]), on) for row, on in sorted(switched)]
+
+        detector = detector_of(on_a_long_hose())
+        return scored("live", logged, live)
+
+    seen = scores()
+    assert (len(seen.errors), len(seen.missed), len(seen.false)) == (4, 0, 0)
+    monkeypatch.setattr(detector_window, "_that_sees", lambda detector, *_: detector)
+    blind = scores()
+    assert len(blind.missed) >= 3
+    assert len(blind.false) >= 3
 
 
 def test_no_breakpoint_is_near_the_level_of_the_last() -> None:

@@ -129,6 +129,9 @@ def _as_in_free_run(detector: DetectorSettings, theta: Theta) -> DetectorSetting
     """
     leaky, rows = free_runs(theta, detector.period)
     tight, leaking = detected_switching([theta, leaky], rows, replace(detector, on_shift=0))
+    if math.isnan(tight.off) and detector.settled != NEVER:
+        detector = _that_sees(detector, theta, rows)
+        tight, leaking = detected_switching([theta, leaky], rows, replace(detector, on_shift=0))
     swing_period_rows = round(
         swing(theta, float(theta[c.NEAR_INERTANCE] + theta[c.INERTANCE])) / detector.period
     )
@@ -148,6 +151,29 @@ def _as_in_free_run(detector: DetectorSettings, theta: Theta) -> DetectorSetting
     return replace(detector, again=again, apart=apart, goes_off=goes_off)
 
 
+def _that_sees(detector: DetectorSettings, theta: Theta, rows: int) -> DetectorSettings:
+    """A blind ``detector`` with its window doubled until it sees a free run's nozzle go off.
+
+    While a line rings as suction begins, a narrow window takes that for the nozzle, and is blind
+    to the nozzle itself. Unchanged where no window up to the longest sees it, or it never goes off.
+    """
+    if bend_in_free_run(theta, rows, detector.period) == 0.0:
+        return detector
+    for window in _doubled(detector):
+        wider = replace(detector, window=window)
+        (tight,) = detected_switching([theta], rows, replace(wider, on_shift=0))
+        if math.isfinite(tight.off):
+            return wider
+    return detector
+
+
+def _doubled(detector: DetectorSettings) -> Iterator[int]:
+    """Wider windows, up to the longest."""
+    window = detector.window
+    while window < detector.longest:
+        yield (window := min(2 * window, detector.longest))
+
+
 def select_window(detector: DetectorSettings, blocks: Iterable[Samples]) -> DetectorSettings:
     """Settings with the narrowest window that sees the nozzle go off in most suctions of a record.
 
@@ -157,9 +183,9 @@ def select_window(detector: DetectorSettings, blocks: Iterable[Samples]) -> Dete
     if detector.settled == NEVER:
         return detector
     best, (best_count, suctions) = detector, _count_nozzle_off(detector, blocks)
-    window = detector.window
-    while best_count < suctions and window < detector.longest:
-        window = min(2 * window, detector.longest)
+    for window in _doubled(detector):
+        if best_count == suctions:
+            break
         wider = replace(detector, window=window)
         if (count := _count_nozzle_off(wider, blocks)[0]) > best_count:
             best, best_count = wider, count
