@@ -1,6 +1,7 @@
 """The fault run in short, and that it would see what it looks for."""
 
 import os
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,6 +28,22 @@ def test_after_every_disturbance_the_log_is_true_and_the_twin_right(
     assert verdict.problems == []
     assert len(done) == len(set(done)) == 6
     assert verdict.counts["rows"] > 15_000
+
+
+def test_a_lie_does_not_put_a_value_into_three_records() -> None:
+    """They are as long as the header, and nothing could tell a false pressure from a true one."""
+    random = np.random.default_rng(2)
+    mbap, head = b"\0\1\0\0\0\x1b\1", b"\3\x18"
+    records = b"".join(struct.pack(">HHf", number, 1, 400.0) for number in range(3))
+    header = struct.pack(">IqHHHHHH", 7, 10**18, 1, 1000, 4096, 4, 6000, 0)
+    changed = {
+        name: any(
+            lie[9:] != data and lie[:2] == mbap[:2] and lie[7:9] == head
+            for lie in (fault_run.lie_by_modbus(mbap + head + data, random) for _ in range(200))
+        )
+        for name, data in (("records", records), ("header", header))
+    }
+    assert changed == {"records": False, "header": True}
 
 
 # Logs that are not true.

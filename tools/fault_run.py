@@ -38,6 +38,7 @@ import psutil
 import tomli_w
 from asyncua import Client, ua
 
+from drivers.modbus.ring import RECORD_WORDS
 from drivers.plc.live import WITNESSED
 from twin.events import Event, Kind
 from twin.log.part import SUFFIX, first_parts
@@ -51,7 +52,8 @@ CONFIGS = {"modbus": "test_rig", "opcua": "test_rig_opcua"}
 RIGHT_MBAR = 3.0  # rms of a cycle; healthy ones have 0.6
 SETTLED_S = 8.0  # from the end of a disturbance to the next
 GROWTH_MB = 12.0
-HEADER_BYTES = 9 + 2 * 12  # of an answer with the trace's header
+HEADER_BYTES = 9 + 2 * 12  # of an answer with the trace's header; three records have as many
+SCAN_US = 1000  # of the PLC of both configurations
 LIES = 0.2  # share of false answers of a PLC that lies
 MB = b"\0" * 1_000_000
 # The twin with a clock that signals set, as an operator or a time server would.
@@ -148,9 +150,17 @@ class Proxy:
         self.hang_up()
 
 
+def has_header(answer: bytes) -> bool:
+    """Whether an answer of Modbus brings the trace's header, and not three records."""
+    if len(answer) != HEADER_BYTES:
+        return False
+    period_us, _depth, record_words = struct.unpack(">3H", answer[9 + 14 : 9 + 20])
+    return (period_us, record_words) == (SCAN_US, RECORD_WORDS)
+
+
 def lie_by_modbus(data: bytes, random: np.random.Generator) -> bytes:
     """An answer that is detectably wrong; in a header often a value."""
-    if len(data) == HEADER_BYTES and random.random() < 0.7:
+    if has_header(data) and random.random() < 0.7:
         lies = [
             (0, random.bytes(4)),  # the sequence
             (4, struct.pack(">q", 2**63 - 1)),  # the time
