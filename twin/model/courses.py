@@ -117,7 +117,8 @@ def _changes(
         elif step := _ramp_step(cause, seconds):
             times = cause.onset_s + step * np.arange(RAMP_STEPS)
         elif cause.course == Course.INTERMITTENT:
-            rows |= set((np.flatnonzero(np.diff(cycles)) + 1).tolist())
+            acts = np.isin(cycles, [*cause.cycles])
+            rows |= set((np.flatnonzero(np.diff(acts)) + 1).tolist())
         rows |= set(np.searchsorted(seconds, times).tolist())
     return sorted(row for row in rows if row < len(seconds))
 

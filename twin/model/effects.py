@@ -8,6 +8,7 @@ extended model sets them.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from twin.errors import ConfigError
 from twin.model import theta as c
@@ -144,6 +145,12 @@ class Effect:
     acts: Callable[[Theta], bool] = lambda _: True  # whether the effect can act on a unit
     law: Law | None = None
     can_be_mended: bool = True
+
+    @cached_property
+    def takes(self) -> frozenset[str]:
+        """Names of its parameters and of its law."""
+        law = [self.law.name] if self.law else []
+        return frozenset([*(parameter.name for parameter in self.parameters), *law])
 
     @property
     def touches(self) -> frozenset[int]:
@@ -525,21 +532,23 @@ def apply(theta: Theta, name: str, values: Mapping[str, float]) -> Theta:
     Raises ConfigError for an unknown effect or parameter and for a value out of bounds.
     """
     effect = effect_of(name)
-    names = {parameter.name for parameter in effect.parameters}
-    names |= {effect.law.name} if effect.law else set()
-    if unknown := set(values) - names:
-        raise ConfigError(f"{name} has no parameter {', '.join(sorted(unknown))}", f"has {names}")
-    for parameter in effect.parameters:
-        value = values.get(parameter.name, parameter.neutral(theta))
-        if not parameter.low <= value <= parameter.high:
+    if not values.keys() <= effect.takes:
+        unknown = ", ".join(sorted(values.keys() - effect.takes))
+        raise ConfigError(f"{name} has no parameter {unknown}", f"has {set(effect.takes)}")
+    sizes = [
+        values[parameter.name] if parameter.name in values else parameter.neutral(theta)
+        for parameter in effect.parameters
+    ]
+    for parameter, size in zip(effect.parameters, sizes, strict=True):
+        if not parameter.low <= size <= parameter.high:
             raise ConfigError(
-                f"{name}.{parameter.name} = {value} {parameter.unit} is out of bounds",
+                f"{name}.{parameter.name} = {size} {parameter.unit} is out of bounds",
                 f"between {parameter.low} and {parameter.high}",
             )
     changed = theta.copy()
     if effect.law and effect.law.name in values:
         changed[effect.law.coefficient] = values[effect.law.name]
-    effect.act(changed, *(values.get(p.name, p.neutral(theta)) for p in effect.parameters))
+    effect.act(changed, *sizes)
     return changed
 
 
