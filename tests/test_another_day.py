@@ -20,7 +20,7 @@ from twin.model import theta as c
 from twin.model.courses import Cause, Course
 from twin.model.effects import EFFECTS
 from twin.model.theta import Theta
-from twin.monitor.another_day import unsure
+from twin.monitor.another_day import KELVINS_AN_HOUR, MOST_KELVINS, Day, unsure
 from twin.monitor.detector_window import expected_detector, select_window
 from twin.monitor.switching_detector import PhaseFinder
 from twin.settings import Document
@@ -225,3 +225,28 @@ def test_where_no_air_is_saved_no_switching_is_looked_for() -> None:
     assert hold(theta) > 0
     theta[c.AIR_SAVING] = c.OFF
     assert hold(theta) == 0
+
+
+# --- while the loop runs --------------------------------------------------------------------------
+
+
+def test_how_far_two_days_are_apart() -> None:
+    evening, morning = Day(0.0, 1e5, 300.0), Day(12.0, 1.01e5, 297.0)
+    higher, denser = evening.until(morning, temperature_is_measured=True)
+    assert higher == 1e3
+    assert denser == pytest.approx(math.hypot(0.01, 0.005))
+    assert evening.until(evening, temperature_is_measured=True) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("hours", "kelvins"), [(0.0, 0.0), (2.0, 2.0 * KELVINS_AN_HOUR), (-2, 2)])
+def test_without_a_thermometer_it_may_be_warmer_the_longer_ago_it_was(
+    hours: float, kelvins: float
+) -> None:
+    now, later = Day(0.0, 1e5, 300.0), Day(hours, 1e5, 300.0)
+    _, denser = now.until(later, temperature_is_measured=False)
+    assert denser == pytest.approx(kelvins / 600.0)
+
+
+def test_a_hall_is_never_much_warmer() -> None:
+    now, later = Day(0.0, 1e5, 300.0), Day(1e4, 1e5, 300.0)
+    assert now.until(later, temperature_is_measured=False)[1] == MOST_KELVINS / 600.0

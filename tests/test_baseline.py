@@ -47,7 +47,7 @@ def test_single_cycles_are_out_as_often_as_wanted_however_few_are_known(cycles: 
         unit = commissioned(rng, cycles)
         for values in rng.normal(MEAN, SIGMA, (10, len(NAMES))):
             figures = dict(zip(NAMES, values, strict=True))
-            normal = unit.normal(figures, SMALLEST)
+            normal = unit.normal(figures, SMALLEST, {})
             out += bool((np.abs(normal) >= limit).any())
             unit.learn(figures, normal)
     asked = units * 10 / wanted  # 80: two standard deviations are 0.22 of it
@@ -61,7 +61,7 @@ def test_an_rms_is_out_no_more_often_than_wanted() -> None:
     for _ in range(400):
         unit = commissioned(rng, 12, names)
         for values in np.abs(rng.normal(0.0, SIGMA, (10, len(names)))):
-            normal = unit.normal(dict(zip(names, values, strict=True)), SMALLEST)
+            normal = unit.normal(dict(zip(names, values, strict=True)), SMALLEST, {})
             assert (normal >= 0.0).all()
             out += bool((normal >= limit).any())
     assert 80 / 1.4 < out < 80 * 1.4
@@ -70,14 +70,24 @@ def test_an_rms_is_out_no_more_often_than_wanted() -> None:
 def test_what_is_smaller_than_an_alarm_is_worth_is_nothing() -> None:
     unit = commissioned(np.random.default_rng(2), 40)
     at = dict.fromkeys(NAMES, MEAN)
-    near, far = (unit.normal({**at, "hold_mean": MEAN + by}, 5.0)[2] for by in (4.5, 30.0))
+    near, far = (unit.normal({**at, "hold_mean": MEAN + by}, 5.0, {})[2] for by in (4.5, 30.0))
     assert near == 0.0
     assert far > 4.0
 
 
+def test_what_another_day_may_do_to_a_figure_is_nothing_and_no_other_figure_is_excused() -> None:
+    unit = commissioned(np.random.default_rng(2), 40)
+    figures = dict.fromkeys(NAMES, MEAN + 15.0)
+    in_doubt = unit.normal(figures, SMALLEST, {"hold_mean": 18.0})
+    assert in_doubt[2] == 0.0
+    every_day = unit.normal(figures, SMALLEST, {})
+    assert every_day[2] > 4.0
+    assert (np.delete(in_doubt, 2) == np.delete(every_day, 2)).all()
+
+
 def test_a_figure_that_a_cycle_does_not_show_is_not_judged() -> None:
     unit = commissioned(np.random.default_rng(3), 40)
-    normal = unit.normal({"idle_mean": MEAN}, SMALLEST)
+    normal = unit.normal({"idle_mean": MEAN}, SMALLEST, {})
     assert np.isfinite(normal).tolist() == [True, False, False, False]
     unit.learn({"idle_mean": MEAN}, normal)
     assert np.isfinite(unit.sigma).all()
@@ -90,7 +100,7 @@ def test_after_the_first_cycles_nothing_is_learned_so_a_slow_change_shows() -> N
     for cycle in range(LEARNED + 4000):
         drift = 0.005 * SIGMA * max(cycle - LEARNED, 0)
         figures = dict(zip(NAMES, rng.normal(MEAN + drift, SIGMA, len(NAMES)), strict=True))
-        normal = unit.normal(figures, SMALLEST)
+        normal = unit.normal(figures, SMALLEST, {})
         if (np.abs(normal) >= limit).any():
             break
         unit.learn(figures, normal)

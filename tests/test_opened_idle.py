@@ -20,6 +20,7 @@ from twin.live import Twin, run
 from twin.model import theta as c
 from twin.model.dataset import coefficients
 from twin.model.theta import Theta
+from twin.monitor import isolation
 from twin.monitor.surroundings import PACE, RANGE, OpenedIdle, Surroundings
 from twin.quality import Quality
 from twin.signals import MBAR, TICK, Command, Phase, Samples, Ticks
@@ -284,6 +285,45 @@ def weather_day() -> Samples:
 def test_weather_of_a_day_is_no_alarm() -> None:
     assert watched(weather_day()).of(Kind.DEVIATION) == []
     assert watched(weather_day(), idle=False).of(Kind.DEVIATION)
+
+
+@cache
+def night(mbar: float, *, barometer: bool) -> Samples:
+    """A day of calm weather and, after a night, the next in other weather."""
+    hours = [*np.arange(0.0, 6.0, 0.5).tolist(), *np.arange(17.5, 21.5, 0.5).tolist()]
+    here = [mbar if hour > 12.0 else 0.0 for hour in hours]
+    segments = [
+        rigs.recorded("gripper", 8.0, (f"ambient_pressure={other:g}",), seed)[0]
+        for seed, other in enumerate(here)
+    ]
+    rows = day(segments, hours)
+    if barometer:
+        lasts = [len(segment) for segment in segments]
+        rows["ambient"] = CALM + MBAR * np.repeat(np.array(here, "f4"), lasts)
+    return rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mbar", "barometer"), [(-12.0, True), (12.0, True), (-12.0, False)])
+def test_other_weather_in_the_morning_is_no_alarm_of_sums_over_cycles(
+    mbar: float, barometer: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples = night(mbar, barometer=barometer)
+    assert watched(samples).of(Kind.DEVIATION) == []
+    monkeypatch.setattr(isolation, "DAY", 0.0)
+    assert watched(samples).of(Kind.DEVIATION)
+
+
+@pytest.mark.slow
+def test_a_leak_in_the_morning_is_an_alarm_in_other_weather_too() -> None:
+    samples = night(-12.0, barometer=True).copy()
+    faulty = ("ambient_pressure=-12", "leakage=1.5")
+    last, _ = rigs.recorded("gripper", 8.0, faulty, 77)
+    begin = len(samples) - len(last)
+    samples["pressure"][begin:] = last["pressure"]
+    samples["commands"][begin:] = last["commands"]
+    (first, *_) = watched(samples).of(Kind.DEVIATION)
+    assert first.time_ns >= samples["time_ns"][begin]
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """What a cycle says: between rows that are known, and whatever cycles were heard before it."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,15 @@ def test_scores_and_sizes_are_those_of_the_inverse_covariance(heard: list[CycleI
     np.testing.assert_allclose(said.scores()[shown], (along / np.sqrt(power))[shown], rtol=1e-9)
     np.testing.assert_allclose(said.sizes()[shown], (along / power)[shown], rtol=1e-9)
     np.testing.assert_allclose(np.diag(said.alike())[shown], 1.0)
+
+
+def test_a_change_moves_scores_as_if_it_were_the_residual(heard: list[CycleInput]) -> None:
+    said = extractor().extract(*heard[0])
+    assert said
+    changes = np.random.default_rng(1).normal(size=(len(said.off), 2))
+    moved = [replace(said, off=change).scores() for change in changes.T]
+    shown = np.isfinite(said.scores())
+    np.testing.assert_allclose(said.moved_by(changes)[shown], np.hypot(*moved)[shown])
 
 
 def assert_same(residual: CycleResidual | None, other: CycleResidual | None) -> None:

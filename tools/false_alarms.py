@@ -38,9 +38,10 @@ from tools.version import commit
 from twin.calibration.calibrate import limited
 from twin.cli.setup import pair_of
 from twin.config import Config
-from twin.events import Kind
+from twin.events import Event, Kind
 from twin.figures.settings import LIMITED, Limits, limits_of
 from twin.files import private_folder, user_cache
+from twin.model import theta as c
 from twin.monitor.baseline import LEARNED, Baseline
 from twin.monitor.false_alarm_budget import (
     LIMITS,
@@ -125,11 +126,10 @@ def device(seed: int, cycles: int) -> Device:
     isolation = _Recording.of(config.data, config.monitor.healthy, NEVER_DAYS)
     monitor.isolation = isolation
     seconds = (LEARNED + cycles) * CYCLE_S
-    events = [
-        event
-        for block in blocks(rig, seconds, seed=seed, block=20_000)
-        for event in monitor.update(*twin.advance(block))
-    ]
+    events = list[Event]()
+    for block in blocks(rig, seconds, seed=seed, block=20_000):
+        block["temperature"] = twin.theta[c.TEMPERATURE]  # without, sums leave a hall's out
+        events += monitor.update(*twin.advance(block))
     summaries = [event.data for event in events if event.kind is Kind.CYCLE]
     farthest, shown = _farthest(config, [data for data in summaries if "probabilities" in data])
     key_figures = [[data.get(f"{name}_measured", np.nan) for name in LIMITED] for data in summaries]
@@ -166,7 +166,7 @@ def _farthest(config: Config, cycles: Sequence[Mapping[str, Any]]) -> tuple[Floa
     baseline, farthest, shown = Baseline(config.monitor.healthy), [], 0
     for cycle in cycles:
         figures = {name: float(cycle[name]) for name in baseline.names if name in cycle}
-        normal = baseline.normal(figures, config.monitor.smallest_mbar)
+        normal = baseline.normal(figures, config.monitor.smallest_mbar, {})
         baseline.learn(figures, normal)
         farthest.append(float(np.nanmax(np.abs(normal))))
         shown = len(figures)

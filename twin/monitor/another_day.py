@@ -9,11 +9,42 @@ uncertain as well if nobody measures it.
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 from twin.model import theta as c
 from twin.model.effects import apply, standing_for
 from twin.model.theta import Theta
 from twin.signals import MBAR
+
+HOUR_NS = 3_600_000_000_000
+# K, one sigma of the temperature between two cycles without a thermometer: halls warm up by some
+# kelvins in a morning. Chosen; over a year see HALL_K.
+KELVINS_AN_HOUR, MOST_KELVINS = 1.0, 5.0
+
+
+class Day(NamedTuple):
+    """When something was, and the surroundings as far as they are known."""
+
+    hour: float  # of receipt
+    ambient: float  # Pa
+    temperature: float  # K, that of the data set if nobody measures it
+
+    @classmethod
+    def of(cls, theta: Theta, host_ns: int) -> "Day":
+        """The time of a row, and the surroundings in coefficients."""
+        return cls(int(host_ns) / HOUR_NS, float(theta[c.AMBIENT]), float(theta[c.TEMPERATURE]))
+
+    def until(self, other: "Day", *, temperature_is_measured: bool) -> tuple[float, float]:
+        """Change of ambient pressure (Pa), and relative change of densities in flows.
+
+        Sonic flows are proportional to the root of temperature.
+        """
+        higher = other.ambient - self.ambient
+        warmer = other.temperature - self.temperature
+        if not temperature_is_measured:
+            warmer = min(KELVINS_AN_HOUR * abs(other.hour - self.hour), MOST_KELVINS)
+        return higher, math.hypot(higher / self.ambient, warmer / self.temperature / 2.0)
+
 
 Way = tuple[Theta, Theta]  # coefficients one sigma to either side
 

@@ -47,13 +47,17 @@ class Baseline:
         excess: Floats = np.where(self._is_rms, np.maximum(off, 0.0), off)
         return excess
 
-    def normal(self, figures: Mapping[str, float], smallest: float) -> Floats:
+    def normal(
+        self, figures: Mapping[str, float], smallest: float, doubts: Mapping[str, float]
+    ) -> Floats:
         """Each figure as a standard normal value under a healthy unit; NaN without a value.
 
-        Distances up to ``smallest`` from the mean count as none.
+        Distances from the mean up to ``smallest``, or to what is in doubt on the day, count as
+        none.
         """
         reference, excess = self._reference, self.excess(figures)
-        beyond = np.maximum(np.abs(excess) - smallest, 0.0)
+        least = [max(doubts.get(name, 0.0), smallest) for name in self.names]
+        beyond = np.maximum(np.abs(excess) - least, 0.0)
         from_zero = np.where(beyond > 0.0, reference.mean + beyond, 0.0 * beyond)
         about_zero = reference.squares / reference.count + reference.mean**2
         about_mean = reference.squares / (reference.count - 1.0) * (1.0 + 1.0 / reference.count)

@@ -19,9 +19,11 @@ import numpy as np
 from twin.inference.priors import penalty
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH
 from twin.inference.whitening import Covariance, fading, low_rank
+from twin.model import effects
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
-from twin.model.term import KINDS
+from twin.model.term import AGAIN, KINDS
+from twin.monitor.another_day import ALIKE, Day
 from twin.monitor.bins import Floats, averaged
 from twin.monitor.change_detection import (
     FARTHEST,
@@ -40,18 +42,25 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNCERTAIN, ModelBank, Suspect
 from twin.monitor.naming import EXPLAINED, listed_share
-from twin.monitor.statistics import CycleResidual, ScoreExtractor
+from twin.monitor.statistics import LEVELS, CycleResidual, ScoreExtractor
 from twin.monitor.surroundings import told
-from twin.signals import SAMPLE, TICK, Samples, Ticks
+from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
 
 KEPT = 400  # cycles whose scores are kept: an earlier change is not searched
 RECENT = 60  # last cycles whose deviations are kept as well: the cause is isolated from them
 LEARNED = 10  # cycles to learn from before the first verdict
 SHOWN = 3.0  # sigmas of a change in the cycles after its first; below it no cause is searched
+DAY = 2.0  # sigmas of the model's error on another day that are no change
+LEAST_APART = 0.1  # steps of weather, 0.4 mbar or 0.2 K: a day that is less apart is the same
 DOUBTED = 0.05  # probability of any change, from which a cause is searched
 RETURNED = float(np.log(1000.0))  # log odds of a healthy unit at which a change has ended
 DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of a delay, in steps
 FEWEST_BACK = 3  # least cycles until a change counts as ended, however large it was
+
+
+WEATHER_NUMBER = next(i for i, suspect in enumerate(SUSPECTS) if suspect.effect == effects.WEATHER)
+WEATHER = SUSPECTS[WEATHER_NUMBER]
+SUCTION = KINDS.index("suction")
 
 
 class CycleScores(NamedTuple):
@@ -60,6 +69,7 @@ class CycleScores(NamedTuple):
     residual: CycleResidual
     scores: Floats
     seconds: float  # duration of the cycle
+    day: Day
 
 
 @dataclass(frozen=True)
@@ -123,14 +133,13 @@ class Isolation:
         self._reference, self._usual = Reference.of(count), _Usual()
         self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # number of learned cycles
-        self._guard = LearningGuard[
-            tuple[CycleResidual, Floats, NormalScores]
-        ]()  # residuals with their scores
+        self._usual_day = self._last_day = Day(0.0, 0.0, 0.0)  # mean of the learned cycles; last
+        self._guard = LearningGuard[tuple[CycleScores, NormalScores]]()
         self._changes: ChangeDetector | None = None  # from when the signatures' cosines are known
         self._kept: deque[CycleResidual] = deque(maxlen=RECENT)  # some 40 kB each
         self._scored: deque[Floats] = deque(maxlen=KEPT)  # normal scores, of more cycles
         self._cycles, self._seconds = 0, 0.0
-        self._ambient_is_measured = False
+        self._ambient_is_measured = self._temperature_is_measured = False
         self._raised: tuple[int, float] | None = None  # suspect, and size in sigmas per cycle
         self._since = 0  # cycles since the change, while raised
         self._back = 0.0  # log odds that the unit is healthy again
@@ -175,7 +184,9 @@ class Isolation:
     def extract(self, views: Sequence[CycleView]) -> list[CycleScores | None]:
         """Take views of cycles and pieces, in order; return scores, None if not comparable."""
         drawn = [self._bank.take(view.cycle) for view in views]
-        self._ambient_is_measured = any("ambient" in told(view.cycle.samples) for view in views)
+        measured = frozenset[str]().union(*(told(view.cycle.samples) for view in views))
+        self._ambient_is_measured = "ambient" in measured
+        self._temperature_is_measured = "temperature" in measured
         residuals = [
             self._extractor.extract(view.cycle, *rows, view.figures)
             if view.fit and view.cycle.complete
@@ -183,7 +194,14 @@ class Isolation:
             for view, rows in zip(views, drawn, strict=True)
         ]
         return [
-            CycleScores(residual, residual.scores(), view.cycle.seconds) if residual else None
+            CycleScores(
+                residual,
+                residual.scores(),
+                view.cycle.seconds,
+                Day.of(view.theta, view.cycle.samples["host_ns"][-1]),
+            )
+            if residual
+            else None
             for view, residual in zip(views, residuals, strict=True)
         ]
 
@@ -195,32 +213,80 @@ class Isolation:
         ``far`` is the deviation (sigmas) of this cycle alone if its figures are out: such a cycle
         is not learned. If another change ``begins`` with it, the cause is searched from it on.
         """
-        residual, scores, seconds = cycle
         self._cycles += 1
-        self._seconds += seconds
-        step = self._normalizer.take(self._reference.standard(scores))
+        self._seconds += cycle.seconds
+        step = self._normalizer.take(self._reference.standard(self._beside_weather(cycle)))
         normal = step.normal
-        self._kept.append(residual)
+        self._last_day = cycle.day
+        self._kept.append(cycle.residual)
         self._scored.append(normal)
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._guard.forget()
         elif self._changes is None and not far:
-            self._learn(residual, scores, step)
+            self._learn(cycle, step)
         elif not far and (verdict is None or not verdict.causes):
-            for learned in self._guard.take((residual, scores, step), normal):
+            for learned in self._guard.take((cycle, step), normal):
                 self._learn(*learned)
         return verdict
 
-    def _learn(self, residual: CycleResidual, scores: Floats, step: NormalScores) -> None:
+    def doubts(self, cycle: CycleScores) -> dict[str, float]:
+        """What the figures of a cycle may be off on its day (mbar, at most), by figure."""
+        ways = self._ways(cycle.residual, cycle.day)
+        if ways is None:
+            return {}
+        most = {
+            kind: DAY
+            * float(np.sqrt(np.sum(np.abs(ways[cycle.residual.kind == kind]).max(0) ** 2)))
+            for kind in np.unique(cycle.residual.kind).tolist()
+        }
+        most[SUCTION] = max(most.get(SUCTION, 0.0), most.pop(AGAIN, 0.0))
+        names = {kind: (f"{KINDS[kind]}_mean", f"{KINDS[kind]}_rms") for kind in most if kind >= 0}
+        names |= {kind: (LEVELS[kind],) for kind in most if kind < 0}
+        return {name: doubt for kind, doubt in most.items() for name in names[kind]}
+
+    def _beside_weather(self, cycle: CycleScores) -> Floats:
+        """Scores less what the model's error on the day of a cycle may have done."""
+        ways = self._ways(cycle.residual, cycle.day)
+        if ways is None:
+            return cycle.scores
+        mean = np.where(self._reference.count > 0.0, self._reference.mean, 0.0)
+        off = cycle.scores - mean
+        doubt = DAY * cycle.residual.moved_by(ways)
+        scores: Floats = mean + np.sign(off) * np.maximum(np.abs(off) - doubt, 0.0)
+        return scores
+
+    def _ways(self, residual: CycleResidual, day: Day) -> Floats | None:
+        """Model's errors (mbar, one sigma each) on another day than that of the learned cycles.
+
+        They are (places, ways); None on the same day. The twin follows surroundings that are
+        measured; rigs follow them in other ways.
+        """
+        if not self._learned:
+            return None
+        higher, denser = self._usual_day.until(
+            day, temperature_is_measured=self._temperature_is_measured
+        )
+        step = WEATHER.step * MBAR
+        pressure, density = higher / step, denser * day.ambient / step
+        if density < LEAST_APART:
+            return None
+        ways = residual.unsure[:, self._extractor.variant_of == WEATHER_NUMBER]
+        flows = np.arange(ways.shape[1]) >= ways.shape[1] - len(ALIKE)
+        scaled: Floats = ways * np.where(flows, density, pressure)
+        return scaled
+
+    def _learn(self, cycle: CycleScores, step: NormalScores) -> None:
         """Learn a healthy cycle; suspects that it is the first to show are searched from now on."""
-        new = np.isfinite(scores) & (self._reference.count == 0.0)
-        self._reference.add(scores)
+        new = np.isfinite(cycle.scores) & (self._reference.count == 0.0)
+        self._reference.add(cycle.scores)
         self._normalizer.learn(step)
-        self._usual.add(residual)
+        self._usual.add(cycle.residual)
         self._learned += 1
+        days = zip(self._usual_day, cycle.day, strict=True)
+        self._usual_day = Day(*(mean + (value - mean) / self._learned for mean, value in days))
         if new.any():
-            alike = residual.alike()
+            alike = cycle.residual.alike()
             self._alike = np.where(alike != 0.0, alike, self._alike)
         if self._learned == LEARNED:
             self._changes = looked_for(self._suspects)
@@ -298,6 +364,9 @@ class Isolation:
         if not whole:
             return [Likeness(UNKNOWN, None, "", changed)]
         mean, covariance = self._mean(min(whole, RECENT))
+        of_the_day = self._ways(mean, self._last_day)
+        if of_the_day is not None:
+            covariance = covariance + low_rank(of_the_day)
         columns = np.column_stack([mean.off, mean.signatures, mean.larger])
         known = Covariance.of(covariance)
         white = known.white(columns)

@@ -356,7 +356,8 @@ class Monitor:
     ) -> list[Event]:
         """Events of a cycle: its summary, and its alarm or clearing."""
         cycle, _, cycle_figures, judged, _ = view
-        worst, is_out = self._worst(cycle, cycle_figures) if judged else (None, False)
+        doubts = self.isolation.doubts(scores) if self.isolation and scores else {}
+        worst, is_out = self._worst(cycle, cycle_figures, doubts) if judged else (None, False)
         far = abs(worst.sigmas) if worst else 0.0
         begins = is_out and self._begins(cycle, far)
         verdict = self._isolate(scores, far if is_out else 0.0, begins)
@@ -428,14 +429,15 @@ class Monitor:
         return verdict if self._is_commissioned or verdict is None else verdict.unnamed()
 
     def _worst(
-        self, cycle: Cycle, cycle_figures: Mapping[str, float]
+        self, cycle: Cycle, cycle_figures: Mapping[str, float], doubts: Mapping[str, float]
     ) -> tuple[Outlier | None, bool]:
         """The figure that is farthest from healthy, and whether it alone is an alarm.
 
-        The limit is lower while an alarm without a name stands.
+        ``doubts`` (mbar) by figure are what its day may have done. The limit is lower while an
+        alarm without a name stands.
         """
         self._cycles, self._seconds = self._cycles + 1, self._seconds + cycle.seconds
-        normal = self._baseline.normal(cycle_figures, self.settings.smallest_mbar)
+        normal = self._baseline.normal(cycle_figures, self.settings.smallest_mbar, doubts)
         excess = self._baseline.excess(cycle_figures)
         sigmas = excess / self._baseline.sigma
         columns = zip(self._baseline.names, excess, sigmas, normal, strict=True)

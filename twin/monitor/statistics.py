@@ -78,6 +78,14 @@ class CycleResidual:
         scores: Floats = off @ signatures / np.sqrt(np.where(power > 0.0, power, np.nan))
         return scores
 
+    def moved_by(self, changes: Floats) -> Floats:
+        """One sigma of each score by changes (mbar) of one sigma each, (places, n)."""
+        white = Covariance.of(self.alone).white(np.column_stack([self.signatures, changes]))
+        signatures, moves = np.split(white, [self.signatures.shape[1]], axis=1)
+        length = np.sqrt(np.maximum(np.einsum("ij,ij->j", signatures, signatures), WEAK))
+        sigmas: Floats = np.sqrt(np.sum((signatures.T @ moves) ** 2, axis=1)) / length
+        return sigmas
+
     def sizes(self) -> Floats:
         """Best size (steps) of each suspect by itself; NaN as in ``scores``."""
         off, signatures, power = self._whitened()
