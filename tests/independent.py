@@ -27,7 +27,7 @@ from drivers.plc.settings import PlcSettings
 from drivers.plc.simulate import blocks as simulated_blocks
 
 PEERS = Path(__file__).parent / "peers"
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0  # a busy machine takes longer than others
 SCANS = 150_000
 COMMANDS = np.array([0, 1, 0, 2], np.uint8)  # for 256 scans each, over and over
 
