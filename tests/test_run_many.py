@@ -37,6 +37,8 @@ from twin.quality import BREAK
 from twin.run_many import run_together
 
 PATIENCE_S = 40.0
+# What a log of a healthy run tells; on a busy machine a twin may be late, and says so.
+HEALTHY = {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
 TAGS = {
     "pressure": {"address": "30002", "type": "float32", "unit": "mbar", "reference": "absolute"}
 }
@@ -297,7 +299,7 @@ def test_several_ejectors_each_with_its_twin_and_log(tmp_path: Path) -> None:
     assert all(log.complete for log in opened)
     assert [log.header.asset_id for log in opened] == ["test_rig", "gripper", "far/away"]
     for healthy in opened[:2]:
-        assert kinds(healthy) <= {Kind.CYCLE, Kind.CLOCK}
+        assert kinds(healthy) <= HEALTHY
         assert not any((samples["quality"] & BREAK).any() for samples, _ in healthy.blocks())
     assert "far_away  alarm    plc_stale" in said
     assert "test_rig  info     cycle" in said
@@ -343,7 +345,7 @@ def test_several_ejectors_of_one_opc_ua_server(tmp_path: Path) -> None:
     for name, log in zip(names, map(open_log, logs), strict=True):
         assert log.complete
         assert log.header.asset_id == name
-        assert kinds(log) <= {Kind.CYCLE, Kind.CLOCK}
+        assert kinds(log) <= HEALTHY
         assert not any((samples["quality"] & BREAK).any() for samples, _ in log.blocks())
     left, right = (np.concatenate([rows for rows, _ in open_log(path).blocks()]) for path in logs)
     _, *same = np.intersect1d(left["sequence"], right["sequence"], return_indices=True)
@@ -402,7 +404,7 @@ def test_plcs_that_are_off_when_the_twin_starts_are_read_once_they_are_on(tmp_pa
     assert "no connection" not in complaints  # it was said already
     for log in logs:
         assert open_log(log).complete
-        assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
+        assert kinds(open_log(log)) <= HEALTHY
 
 
 @pytest.mark.slow
@@ -437,7 +439,7 @@ def test_a_twin_alone_waits_for_an_opc_ua_server_and_for_its_nodes(
     once = ("no connection", "it is tried until", "there is no node", "the PLC answers")
     assert [sum(what in line for line in told) for what in once] == [1, 1, 1, 1], told
     assert open_log(log).complete
-    assert kinds(open_log(log)) <= {Kind.CYCLE, Kind.CLOCK, Kind.TWIN_LATE}
+    assert kinds(open_log(log)) <= HEALTHY
 
 
 def said_until(stream: IO[str], what: str) -> list[str]:
