@@ -6,14 +6,12 @@ import pytest
 from scipy.stats import kstest
 
 from twin.monitor.change_detection import (
-    LEARNED_LATE,
     MOST_WAITING,
     WAITS,
     ChangeDetector,
     LearningGuard,
     Reference,
     ScoreNormalizer,
-    SlowScatter,
     began,
     limit,
 )
@@ -231,29 +229,3 @@ def test_sums_of_several_devices_are_those_of_each() -> None:
     together.begin_some(np.array([True, False, False, False]))
     assert np.isneginf(together._log[0]).all()
     assert np.isfinite(together.log_sums[1:]).all()
-
-
-# --- slow wander ----------------------------------------------------------------------------------
-
-
-def wander_of(rows: Floats) -> Floats:
-    reference, slow = Reference.of(rows.shape[1]), SlowScatter(rows.shape[1])
-    for scores in rows:
-        reference.add(scores)
-        slow.add(scores - reference.mean)
-    return slow.sigmas(reference)
-
-
-def test_what_cycles_after_one_another_share_is_wander() -> None:
-    rng, keep = np.random.default_rng(3), 0.9
-    white = rng.normal(size=(400, 20))
-    slow = np.zeros_like(white)
-    for row in range(1, len(slow)):
-        slow[row] = keep * slow[row - 1] + np.sqrt(1.0 - keep**2) * rng.normal(size=20)
-    assert np.median(wander_of(white + 2.0 * slow)) == pytest.approx(2.0, rel=0.25)
-    assert np.mean(wander_of(white) > 0.0) <= 0.25
-    assert not wander_of((white + 2.0 * slow)[:LEARNED_LATE]).any()
-
-
-def test_wander_of_a_suspect_that_no_cycle_shows_is_none() -> None:
-    assert wander_of(np.full((60, 2), np.nan)).tolist() == [0.0, 0.0]

@@ -75,17 +75,6 @@ def morning(mbar: float, kelvins: float) -> Samples:
     return day(segments, hours)
 
 
-def alarms(samples: Samples) -> int:
-    unit = commissioned().unit
-    assert unit is not None
-    days, healthy = unit.monitor.false_alarm_days, unit.monitor.healthy
-    judging = Isolation.of(unit.data, healthy, days)
-    monitor = Monitor(unit.monitor, coefficients(unit.data), isolation=judging)
-    seen = rigs.Collect()
-    run(rigs.cut(samples, 5000), Twin.of(unit.data), monitor, [seen])
-    return len(seen.of(Kind.DEVIATION))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize(("mbar", "kelvins"), [(-12.0, 0.0), (0.0, -8.0)])
@@ -93,6 +82,17 @@ def test_other_weather_in_the_morning_is_no_alarm(
     mbar: float, kelvins: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rig follows pressure and temperature of the air in another way than the model."""
-    assert alarms(morning(mbar, kelvins)) == 0
-    monkeypatch.setattr(isolation, "NO_CHANGE", 0.0)
-    assert alarms(morning(mbar, kelvins)) > 0
+    unit = commissioned().unit
+    assert unit is not None
+
+    def alarms() -> int:
+        days, healthy = unit.monitor.false_alarm_days, unit.monitor.healthy
+        judging = Isolation.of(unit.data, healthy, days)
+        monitor = Monitor(unit.monitor, coefficients(unit.data), isolation=judging)
+        seen = rigs.Collect()
+        run(rigs.cut(morning(mbar, kelvins), 5000), Twin.of(unit.data), monitor, [seen])
+        return len(seen.of(Kind.DEVIATION))
+
+    assert alarms() == 0
+    monkeypatch.setattr(isolation, "DAY", 0.0)
+    assert alarms() > 0

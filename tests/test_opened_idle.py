@@ -310,7 +310,7 @@ def test_other_weather_in_the_morning_is_no_alarm_of_sums_over_cycles(
 ) -> None:
     samples = night(mbar, barometer=barometer)
     assert watched(samples).of(Kind.DEVIATION) == []
-    monkeypatch.setattr(isolation, "NO_CHANGE", 0.0)
+    monkeypatch.setattr(isolation, "DAY", 0.0)
     assert watched(samples).of(Kind.DEVIATION)
 
 

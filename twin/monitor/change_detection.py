@@ -9,7 +9,6 @@ alarm, except for the overshoot.
 """
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -32,8 +31,6 @@ MOST = 5.0
 STRANGE = 3.5  # sigmas: a larger score is not learned at once, since a change may begin
 WAITS = 4  # cycles for which learning then pauses; a large change raises an alarm by then
 MOST_WAITING = 20  # cycles after which scores that stay strange without an alarm are learned
-BY_CHANCE = 1.5  # sigmas of a correlation with the cycle before that count as none
-LEARNED_LATE = 10  # cycles after which wander is learned
 FARTHEST = 30.0  # sigmas; the probability beyond underflows
 # Prior cycles with neither skewness nor correlation; sigmas at which scores are clipped for both.
 UNSKEWED, COUNTS = 100.0, 4.0
@@ -56,12 +53,6 @@ class Reference:
         """Statistics without any cycle."""
         return cls(np.zeros(suspects), np.zeros(suspects), np.zeros(suspects))
 
-    @property
-    def sigma(self) -> Floats:
-        """One sigma of each score."""
-        sigma: Floats = np.sqrt(self.squares / np.maximum(self.count - 1.0, 1.0))
-        return sigma
-
     def standard(self, scores: Floats) -> Floats:
         """Scores as standard normal values by the distribution of the scores before.
 
@@ -81,40 +72,6 @@ class Reference:
         off = np.where(shown, scores - self.mean, 0.0)
         self.mean = self.mean + off / np.maximum(self.count, 1.0)
         self.squares = self.squares + np.where(shown, off * (scores - self.mean), 0.0)
-
-
-class SlowScatter:
-    """How far scores of healthy cycles wander slowly: by gusts and doors, a regulator, warmth.
-
-    It is what a score shares with that of the cycle before, as far as that is more than chance.
-    Sums take such a wander for a change. It is learned late: a change that grows slowly would be
-    taken for wander while it is still small.
-    """
-
-    def __init__(self, suspects: int) -> None:
-        self._count, self._products = np.zeros((2, suspects))
-        self._before = np.full(suspects, np.nan)
-        self._recent = deque[Floats]()
-
-    def add(self, off: Floats) -> None:
-        """Add a cycle's scores less their means; NaN as in ``Reference``."""
-        self._recent.append(off)
-        if len(self._recent) <= LEARNED_LATE:
-            return
-        off = self._recent.popleft()
-        products = off * self._before
-        self._count = self._count + np.isfinite(products)
-        self._products = self._products + np.nan_to_num(products)
-        self._before = off
-
-    def sigmas(self, reference: Reference) -> Floats:
-        """One sigma of the wander of each score; 0 while none shows."""
-        count = np.maximum(self._count, 1.0)
-        variance = reference.sigma**2
-        # Less the mean of so few, a score seems to share less with the one before than it does.
-        shared = (self._products + variance) / count - BY_CHANCE * variance / np.sqrt(count)
-        sigmas: Floats = np.sqrt(np.maximum(shared, 0.0))
-        return sigmas
 
 
 @dataclass(frozen=True)

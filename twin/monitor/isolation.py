@@ -33,7 +33,6 @@ from twin.monitor.change_detection import (
     NormalScores,
     Reference,
     ScoreNormalizer,
-    SlowScatter,
     began,
     limit,
 )
@@ -51,14 +50,12 @@ KEPT = 400  # cycles whose scores are kept: an earlier change is not searched
 RECENT = 60  # last cycles whose deviations are kept as well: the cause is isolated from them
 LEARNED = 10  # cycles to learn from before the first verdict
 SHOWN = 3.0  # sigmas of a change in the cycles after its first; below it no cause is searched
-NO_CHANGE = 2.0  # sigmas of slow wander, and of the model's error on another day, are no change
+DAY = 2.0  # sigmas of the model's error on another day that are no change
 LEAST_APART = 0.1  # steps of weather, 0.4 mbar or 0.2 K: a day that is less apart is the same
 DOUBTED = 0.05  # probability of any change, from which a cause is searched
 RETURNED = float(np.log(1000.0))  # log odds of a healthy unit at which a change has ended
 DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of a delay, in steps
 FEWEST_BACK = 3  # least cycles until a change counts as ended, however large it was
-
-
 WEATHER_NUMBER = next(i for i, suspect in enumerate(SUSPECTS) if suspect.effect == effects.WEATHER)
 WEATHER = SUSPECTS[WEATHER_NUMBER]
 SUCTION = KINDS.index("suction")
@@ -132,7 +129,7 @@ class Isolation:
         self.days = days
         self._suspects, count = extractor.suspects, len(extractor.suspects)
         self._reference, self._usual = Reference.of(count), _Usual()
-        self._normalizer, self._slow = ScoreNormalizer(count), SlowScatter(count)
+        self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # number of learned cycles
         self._usual_day = self._last_day = Day(0.0, 0.0, 0.0)  # mean of the learned cycles; last
         self._guard = LearningGuard[tuple[CycleScores, NormalScores]]()
@@ -216,7 +213,7 @@ class Isolation:
         """
         self._cycles += 1
         self._seconds += cycle.seconds
-        step = self._normalizer.take(self._reference.standard(self._as_changed(cycle)))
+        step = self._normalizer.take(self._reference.standard(self._beside_weather(cycle)))
         normal = step.normal
         self._last_day = cycle.day
         self._kept.append(cycle.residual)
@@ -237,7 +234,7 @@ class Isolation:
         if ways is None:
             return {}
         most = {
-            kind: NO_CHANGE
+            kind: DAY
             * float(np.sqrt(np.sum(np.abs(ways[cycle.residual.kind == kind]).max(0) ** 2)))
             for kind in np.unique(cycle.residual.kind).tolist()
         }
@@ -246,14 +243,15 @@ class Isolation:
         names |= {kind: (LEVELS[kind],) for kind in most if kind < 0}
         return {name: doubt for kind, doubt in most.items() for name in names[kind]}
 
-    def _as_changed(self, cycle: CycleScores) -> Floats:
-        """Scores less what is no change: slow wander, and what the day of a cycle may have done."""
-        mean = np.where(self._reference.count > 0.0, self._reference.mean, 0.0)
+    def _beside_weather(self, cycle: CycleScores) -> Floats:
+        """Scores less what the model's error on the day of a cycle may have done."""
         ways = self._ways(cycle.residual, cycle.day)
-        of_the_day = 0.0 if ways is None else cycle.residual.moved_by(ways)
-        usual = NO_CHANGE * np.hypot(self._slow.sigmas(self._reference), of_the_day)
+        if ways is None:
+            return cycle.scores
+        mean = np.where(self._reference.count > 0.0, self._reference.mean, 0.0)
         off = cycle.scores - mean
-        scores: Floats = mean + np.sign(off) * np.maximum(np.abs(off) - usual, 0.0)
+        doubt = DAY * cycle.residual.moved_by(ways)
+        scores: Floats = mean + np.sign(off) * np.maximum(np.abs(off) - doubt, 0.0)
         return scores
 
     def _ways(self, residual: CycleResidual, day: Day) -> Floats | None:
@@ -272,6 +270,7 @@ class Isolation:
         if density < LEAST_APART:
             return None
         ways = residual.unsure[:, self._extractor.variant_of == WEATHER_NUMBER]
+        # The last of these ways are those of flows, as ``of_the_day`` gives them.
         flows = np.arange(ways.shape[1]) >= ways.shape[1] - len(ALIKE)
         scaled: Floats = ways * np.where(flows, density, pressure)
         return scaled
@@ -280,7 +279,6 @@ class Isolation:
         """Learn a healthy cycle; suspects that it is the first to show are searched from now on."""
         new = np.isfinite(cycle.scores) & (self._reference.count == 0.0)
         self._reference.add(cycle.scores)
-        self._slow.add(cycle.scores - self._reference.mean)
         self._normalizer.learn(step)
         self._usual.add(cycle.residual)
         self._learned += 1
