@@ -314,6 +314,15 @@ def test_a_change_that_begins_is_not_learned_as_usual() -> None:
     assert 20 <= first.data["cycle"] <= 25
 
 
+@pytest.mark.parametrize(("worth", "is_told"), [(isolation.WORTH, False), (0.0, True)])
+def test_a_steady_change_too_small_for_an_alarm_is_not_told(
+    worth: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(isolation, "WORTH", worth)
+    told = events("gripper", [f"sensor_offset=0.14@c{BEGINS}"], 100, 12)  # of 8 mbar
+    assert bool(raised(told)) is is_told
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "size"), [("test_rig", "leakage", 0.8), ("gripper", "suction_loss", 4.0)]

@@ -15,7 +15,7 @@ from twin.monitor.healthy import Healthy, Scatter
 from twin.monitor.monitor import Monitor
 from twin.monitor.settings import MonitorSettings
 from twin.quality import Quality
-from twin.signals import MBAR, NS, SAMPLE, TICK, Phase, Samples, Ticks
+from twin.signals import MBAR, NS, SAMPLE, TICK, Command, Phase, Samples, Ticks
 
 STREAM = (
     Kind.GAP,
@@ -329,6 +329,53 @@ def test_an_alarm_is_cleared_after_some_good_cycles_and_raised_again() -> None:
     cleared = [cycle_of[event.time_ns] for event in seen.of(Kind.DEVIATION_CLEARED)]
     wanted = rigs.config("test_rig").monitor.clear_cycles
     assert cleared == [6 + wanted, 12 + wanted]
+
+
+def with_odd_cycles(samples: Samples, every: int) -> Samples:
+    """A record in which the pressure of one cycle in ``every`` is 60 mbar higher in its idle."""
+    odd = samples.copy()
+    begins = np.flatnonzero(np.diff((odd["commands"] & Command.SUCTION).astype(np.int8)) > 0) + 1
+    for begin in begins[every::every]:
+        odd["pressure"][begin - 600 : begin - 200] += np.float32(60.0 * MBAR)
+    return odd
+
+
+@pytest.mark.parametrize(("commissioned", "most"), [(12, 5), (64, 12)])
+def test_a_single_odd_cycle_is_told_a_few_times_unless_it_is_too_frequent(
+    commissioned: int, most: int
+) -> None:
+    # One in eight: twelve cycles of a commissioning may well have had none, 64 hardly.
+    samples = with_odd_cycles(rigs.recorded("test_rig", 320.0)[0], 8)
+    healthy = rigs.config("test_rig").monitor.healthy
+    few = {
+        name: scatter.model_copy(update={"cycles": commissioned})
+        for name, scatter in healthy.figures.items()
+    }
+    healthy = healthy.model_copy(update={"figures": few})
+    settings = rigs.config("test_rig").monitor.model_copy(update={"healthy": healthy})
+    watched, twin = Monitor(settings, rigs.theta("test_rig")), rigs.twin("test_rig")
+    events = [e for block in rigs.cut(samples, 5000) for e in watched.update(*twin.advance(block))]
+    times = len([event for event in events if event.kind is Kind.DEVIATION])
+    assert times >= 3
+    assert times <= most if commissioned == 12 else times == most
+
+
+@pytest.mark.parametrize(("blind", "is_told"), [((5,), False), ((5, 12), False), ((5, 6), True)])
+def test_a_cycle_whose_switching_the_twin_has_lost_is_not_judged_alone(
+    blind: Sequence[int], is_told: bool
+) -> None:
+    # A twin that has lost it runs its nozzle on, 60 mbar farther than the rig.
+    samples = rigs.recorded("test_rig", 60.0)[0]
+    rows, ticks = rigs.expectation(rigs.twin("test_rig"), [samples])
+    begins = np.flatnonzero(np.diff((rows["commands"] & Command.SUCTION).astype(np.int8)) > 0) + 1
+    for cycle in blind:
+        here = ticks[begins[cycle] : begins[cycle + 1]]
+        held = here["phase"] == Phase.HOLD
+        here["phase"][held] = Phase.SUCTION
+        here["expected"][held] -= np.float32(60.0 * MBAR)
+    watched = rigs.monitor("test_rig")
+    events = watched.update(rows, ticks) + watched.close()
+    assert (Kind.DEVIATION in kinds(events)) is is_told
 
 
 @pytest.mark.parametrize("size", [3.75, 4.0, 4.25, 6.0])  # ms; the edge is at four

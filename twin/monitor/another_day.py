@@ -16,7 +16,7 @@ from twin.model.effects import apply, standing_for
 from twin.model.theta import Theta
 from twin.signals import MBAR
 
-HOUR_NS = 3_600_000_000_000
+HOUR_NS, HOUR_S = 3_600_000_000_000, 3600.0
 # K, one sigma of the temperature between two cycles without a thermometer: halls warm up by some
 # kelvins in a morning. Chosen; over a year see HALL_K.
 KELVINS_AN_HOUR, MOST_KELVINS = 1.0, 5.0
@@ -33,6 +33,11 @@ class Day(NamedTuple):
     def of(cls, theta: Theta, host_ns: int) -> "Day":
         """The time of a row, and the surroundings in coefficients."""
         return cls(int(host_ns) / HOUR_NS, float(theta[c.AMBIENT]), float(theta[c.TEMPERATURE]))
+
+    @property
+    def seconds(self) -> float:
+        """The time in seconds."""
+        return self.hour * HOUR_S
 
     def until(self, other: "Day", *, temperature_is_measured: bool) -> tuple[float, float]:
         """Change of ambient pressure (Pa), and relative change of densities in flows.

@@ -5,16 +5,36 @@ cycles show neither mean nor scatter well enough for one false alarm in a month.
 stops, so that a slow change stays visible.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtr
 
-from twin.monitor.change_detection import Floats, Reference, as_normal
 from twin.monitor.false_alarm_budget import SINGLE_CYCLES, cycles_between, normal_limit
 from twin.monitor.healthy import Healthy
+from twin.monitor.score_prediction import FARTHEST, Floats
 
 LEARNED = 300  # healthy cycles of the unit, after which a scatter is known to 4 %
+MISSED = 3.0  # odd cycles: a commissioning that should have had so many shows none in one of 20
 LEARNED_WITHIN = 3.5  # sigmas; a cycle farther out is not learned
+
+
+@dataclass
+class Reference:
+    """Statistics of the figures so far: counts, means and sums of squares about the means."""
+
+    count: Floats
+    mean: Floats
+    squares: Floats
+
+    def add(self, figures: Floats) -> None:
+        """Add the figures of a cycle, NaN for one that it does not show (Welford's method)."""
+        shown = np.isfinite(figures)
+        self.count = self.count + shown
+        off = np.where(shown, figures - self.mean, 0.0)
+        self.mean = self.mean + off / np.maximum(self.count, 1.0)
+        self.squares = self.squares + np.where(shown, off * (figures - self.mean), 0.0)
 
 
 class Baseline:
@@ -33,7 +53,8 @@ class Baseline:
         count, mean, sigma = np.array(scatters, np.float64).reshape(-1, 3).T.copy()
         self._reference = Reference(count, mean, (count - 1.0) * sigma**2)
         self._is_rms = np.array([name.endswith("_rms") for name in self.names], bool)
-        self._learned = 0
+        self._learned = self._odd = 0
+        self._commissioned = min((scatter[0] for scatter in scatters), default=0)
 
     @property
     def sigma(self) -> Floats:
@@ -80,5 +101,23 @@ class Baseline:
             self._learned += 1
             self._reference.add(self._values(figures))
 
+    def learn_odd(self, odd: Sequence[Mapping[str, float]], judged: int) -> None:
+        """Learn cycles that were out, once those after them are healthy: the unit has such ones.
+
+        So the first few raise an alarm, and no others. ``judged`` cycles have been seen. Where odd
+        ones are so frequent that the commissioning would have shown some, they are a fault.
+        """
+        self._odd += len(odd)
+        if self._odd / judged * self._commissioned > MISSED:
+            return
+        for figures in odd:
+            self.learn(figures, np.zeros(1))
+
     def _values(self, figures: Mapping[str, float]) -> Floats:
         return np.array([figures.get(name, np.nan) for name in self.names])
+
+
+def as_normal(t: Floats, freedom: Floats) -> Floats:
+    """Student's t as the standard normal value of equal probability; NaN stays."""
+    result: Floats = -np.sign(t) * np.maximum(ndtri(stdtr(freedom, -np.abs(t))), -FARTHEST)
+    return result

@@ -1,7 +1,7 @@
 """Change detection: sums over cycles that find changes too small for a single cycle.
 
-The input is one score for each suspect and cycle. Scores are standardised by those before (Hawkins'
-self-starting method), so that no table of healthy means has to be exact. Each suspect, sign and
+The input is one score for each suspect and cycle, as a standard normal value by those before
+(``score_prediction``), so that no table of healthy means has to be exact. Each suspect, sign and
 size has likelihood ratios of "it began at cycle t" to "nothing changed". They are summed over all t
 (Shiryaev and Roberts). In healthy cycles the weighted sum over all suspects grows by 1 a cycle on
 average, however similar their signatures are. So a limit on it is the number of cycles to a false
@@ -14,7 +14,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri, stdtr
 
 Floats = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -31,47 +30,9 @@ MOST = 5.0
 STRANGE = 3.5  # sigmas: a larger score is not learned at once, since a change may begin
 WAITS = 4  # cycles for which learning then pauses; a large change raises an alarm by then
 MOST_WAITING = 20  # cycles after which scores that stay strange without an alarm are learned
-FARTHEST = 30.0  # sigmas; the probability beyond underflows
 # Prior cycles with neither skewness nor correlation; sigmas at which scores are clipped for both.
 UNSKEWED, COUNTS = 100.0, 4.0
 SKEWED, LEAST_SKEW = 1.5, 1e-6  # largest skewness; a smaller one counts as none
-
-
-@dataclass
-class Reference:
-    """Statistics of the scores so far: counts, means and sums of squares about the means.
-
-    A score is NaN if the cycle does not show the suspect.
-    """
-
-    count: Floats
-    mean: Floats
-    squares: Floats
-
-    @classmethod
-    def of(cls, suspects: int) -> "Reference":
-        """Statistics without any cycle."""
-        return cls(np.zeros(suspects), np.zeros(suspects), np.zeros(suspects))
-
-    def standard(self, scores: Floats) -> Floats:
-        """Scores as standard normal values by the distribution of the scores before.
-
-        NaN also while too few scores are known.
-        """
-        is_known = (self.count >= 2.0) & (self.squares > 0.0)
-        count = np.where(is_known, self.count, 2.0)
-        variance = np.where(is_known, self.squares, 1.0) / (count - 1.0) * (1.0 + 1.0 / count)
-        normal = as_normal((scores - self.mean) / np.sqrt(variance), count - 1.0)
-        result: Floats = np.where(is_known, normal, np.nan)
-        return result
-
-    def add(self, scores: Floats) -> None:
-        """Add the scores of a cycle (Welford's method)."""
-        shown = np.isfinite(scores)
-        self.count = self.count + shown
-        off = np.where(shown, scores - self.mean, 0.0)
-        self.mean = self.mean + off / np.maximum(self.count, 1.0)
-        self.squares = self.squares + np.where(shown, off * (scores - self.mean), 0.0)
 
 
 @dataclass(frozen=True)
@@ -126,12 +87,6 @@ def _unskewed(standard: Floats, skewness: Floats) -> Floats:
     growth = np.maximum(1.0 + spread * sign * standard, LEAST_SKEW)
     normal: Floats = sign * (np.log(growth) / log_sigma + 0.5 * log_sigma)
     return normal
-
-
-def as_normal(t: Floats, freedom: Floats) -> Floats:
-    """Student's t as the standard normal value of equal probability; NaN stays."""
-    result: Floats = -np.sign(t) * np.maximum(ndtri(stdtr(freedom, -np.abs(t))), -FARTHEST)
-    return result
 
 
 class LearningGuard(Generic[T]):

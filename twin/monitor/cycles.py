@@ -28,6 +28,7 @@ OPEN_CUPS = 1.0 / 3.0
 # Share of the cycles that may have met no part. If more have so little vacuum, or the last LASTING
 # cycles have, something is wrong: a fault, or the unit of measurement.
 MOST_WITHOUT_PART, LASTING = 1.0 / 3.0, 2
+FOUND_WITHIN_S = 0.1  # s after a switching of the nozzle, by which it is found live or never
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient, to which the founding paper times evacuation
 
 
@@ -223,6 +224,24 @@ def met_no_part(cycle: Cycle, theta: Theta) -> bool:
     expected = np.fmin.reduce(cycle.ticks["expected"], initial=np.nan)
     ambient = float(theta[c.AMBIENT])
     return bool(ambient - float(lowest) < OPEN_CUPS * (ambient - float(expected)))
+
+
+def lost_a_switching(cycle: Cycle, theta: Theta) -> bool:
+    """Whether the nozzle must have switched off in ``cycle``, and no switching was found.
+
+    The vacuum reached H1 long before suction ended, and no row is in hold. Then the expected
+    pressure is that of a nozzle that runs on, and says nothing of the rig.
+    """
+    if (cycle.ticks["phase"] == HOLD).any():
+        return False
+    in_suction = cycle.ticks["phase"] == SUCTION
+    usable = (cycle.samples["quality"] & UNUSABLE) == 0
+    vacuum = float(theta[c.AMBIENT]) - cycle.samples["pressure"]
+    reached = np.flatnonzero(in_suction & usable & (vacuum >= theta[c.H1]))
+    if not len(reached):
+        return False
+    times = cycle.samples["time_ns"]
+    return float(times[np.flatnonzero(in_suction)[-1]] - times[reached[0]]) * NS > FOUND_WITHIN_S
 
 
 def now_and_then(without_part: Sequence[int], total: int) -> list[int]:

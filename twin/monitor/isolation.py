@@ -11,6 +11,7 @@ signature does not, so a share of the explained deviation counts as error.
 import math
 from collections import deque
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -20,18 +21,17 @@ from twin.inference.priors import penalty
 from twin.inference.unmodelled import LEAST_SURE, MISMATCH
 from twin.inference.whitening import Covariance, fading, low_rank
 from twin.model import effects
+from twin.model import theta as c
 from twin.model.dataset import DataSet
 from twin.model.effects import EFFECTS, UNKNOWN, Effect, effect_of
 from twin.model.term import AGAIN, KINDS
 from twin.monitor.another_day import ALIKE, Day
 from twin.monitor.bins import Floats, averaged
 from twin.monitor.change_detection import (
-    FARTHEST,
     MOST,
     ChangeDetector,
     LearningGuard,
     NormalScores,
-    Reference,
     ScoreNormalizer,
     began,
     limit,
@@ -42,6 +42,7 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.likeness import Likeness
 from twin.monitor.model_bank import DELAY_STEPS, DELAYS, SUSPECTS, UNCERTAIN, ModelBank, Suspect
 from twin.monitor.naming import EXPLAINED, listed_share
+from twin.monitor.score_prediction import FARTHEST, ScorePredictor
 from twin.monitor.statistics import LEVELS, CycleResidual, ScoreExtractor
 from twin.monitor.surroundings import told
 from twin.signals import MBAR, SAMPLE, TICK, Samples, Ticks
@@ -52,6 +53,9 @@ LEARNED = 10  # cycles to learn from before the first verdict
 SHOWN = 3.0  # sigmas of a change in the cycles after its first; below it no cause is searched
 DAY = 2.0  # sigmas of the model's error on another day that are no change
 LEAST_APART = 0.1  # steps of weather, 0.4 mbar or 0.2 K: a day that is less apart is the same
+# Share of a size that is worth an alarm, below which sums raise none: they find a steady change of
+# any size in the end, and nothing of a rig is the same for days.
+WORTH = 0.02
 DOUBTED = 0.05  # probability of any change, from which a cause is searched
 RETURNED = float(np.log(1000.0))  # log odds of a healthy unit at which a change has ended
 DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of a delay, in steps
@@ -128,7 +132,8 @@ class Isolation:
         self._bank, self._extractor = bank, extractor
         self.days = days
         self._suspects, count = extractor.suspects, len(extractor.suspects)
-        self._reference, self._usual = Reference.of(count), _Usual()
+        self._predictor, self._usual = ScorePredictor(count), _Usual()
+        self._ahead = self._predictor  # the same, with the wander of cycles that are not learned
         self._normalizer = ScoreNormalizer(count)
         self._learned = 0  # number of learned cycles
         self._usual_day = self._last_day = Day(0.0, 0.0, 0.0)  # mean of the learned cycles; last
@@ -136,12 +141,15 @@ class Isolation:
         self._changes: ChangeDetector | None = None  # from when the signatures' cosines are known
         self._kept: deque[CycleResidual] = deque(maxlen=RECENT)  # some 40 kB each
         self._scored: deque[Floats] = deque(maxlen=KEPT)  # normal scores, of more cycles
+        self._scores_of: deque[Floats] = deque(maxlen=KEPT)  # scores of these cycles
         self._cycles, self._seconds = 0, 0.0
         self._ambient_is_measured = self._temperature_is_measured = False
         self._raised: tuple[int, float] | None = None  # suspect, and size in sigmas per cycle
         self._since = 0  # cycles since the change, while raised
         self._back = 0.0  # log odds that the unit is healthy again
         self._alike = np.zeros((count, count))  # cosines between signatures; 0 if unknown
+        touched = [suspect.parameter.touches for suspect in self._suspects]
+        self._zeros = [c.SENSOR_OFFSET in coefficients for coefficients in touched]
         ends = [suspect.parameter.range(extractor.theta) for suspect in self._suspects]
         steps = np.array([suspect.step for suspect in self._suspects])
         self._bounds = np.array(ends) / steps[:, None]
@@ -213,20 +221,36 @@ class Isolation:
         """
         self._cycles += 1
         self._seconds += cycle.seconds
-        step = self._normalizer.take(self._reference.standard(self._beside_weather(cycle)))
+        step = self._normalizer.take(
+            self._ahead.normal(self._beside_weather(cycle), cycle.day.seconds)
+        )
         normal = step.normal
         self._last_day = cycle.day
         self._kept.append(cycle.residual)
         self._scored.append(normal)
+        self._scores_of.append(cycle.scores)
         verdict = self._conclude(self._changes, normal, far, begins) if self._changes else None
         if self.stands:
             self._guard.forget()
-        elif self._changes is None and not far:
-            self._learn(cycle, step)
-        elif not far and (verdict is None or not verdict.causes):
-            for learned in self._guard.take((cycle, step), normal):
-                self._learn(*learned)
+        ready = [] if far or self.stands else self._ready(cycle, step, verdict)
+        for learned in ready:
+            self._learn(*learned)
+        if ready or self.stands:
+            self._ahead = self._predictor
+        elif not far:
+            self._ahead = copy(self._ahead)
+            self._ahead.follow(cycle.scores, cycle.day.seconds)
         return verdict
+
+    def _ready(
+        self, cycle: CycleScores, step: NormalScores, verdict: Verdict | None
+    ) -> list[tuple[CycleScores, NormalScores]]:
+        """Cycles to learn now, after one that is not out by itself."""
+        if self._changes is None:
+            return [(cycle, step)]
+        if verdict is not None and verdict.causes:
+            return []
+        return self._guard.take((cycle, step), step.normal)
 
     def doubts(self, cycle: CycleScores) -> dict[str, float]:
         """What the figures of a cycle may be off on its day (mbar, at most), by figure."""
@@ -248,7 +272,7 @@ class Isolation:
         ways = self._ways(cycle.residual, cycle.day)
         if ways is None:
             return cycle.scores
-        mean = np.where(self._reference.count > 0.0, self._reference.mean, 0.0)
+        mean = self._predictor.mean
         off = cycle.scores - mean
         doubt = DAY * cycle.residual.moved_by(ways)
         scores: Floats = mean + np.sign(off) * np.maximum(np.abs(off) - doubt, 0.0)
@@ -277,8 +301,8 @@ class Isolation:
 
     def _learn(self, cycle: CycleScores, step: NormalScores) -> None:
         """Learn a healthy cycle; suspects that it is the first to show are searched from now on."""
-        new = np.isfinite(cycle.scores) & (self._reference.count == 0.0)
-        self._reference.add(cycle.scores)
+        new = np.isfinite(cycle.scores) & (self._predictor.count == 0.0)
+        self._predictor.learn(cycle.scores, cycle.day.seconds)
         self._normalizer.learn(step)
         self._usual.add(cycle.residual)
         self._learned += 1
@@ -287,6 +311,7 @@ class Isolation:
         if new.any():
             alike = cycle.residual.alike()
             self._alike = np.where(alike != 0.0, alike, self._alike)
+            self._predictor.expect_wander(np.abs(self._alike[:, self._zeros]).max(axis=1))
         if self._learned == LEARNED:
             self._changes = looked_for(self._suspects)
         if self._changes and (new.any() or self._learned == LEARNED):
@@ -301,6 +326,9 @@ class Isolation:
         log_odds = log_sum - math.log(cycles)  # prior: a fault is as rare as a false alarm
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)
+        if raised and not self._is_worth_an_alarm(changes):
+            changes.begin()
+            return Verdict(1.0, ())
         if raised:
             self._raise(changes)
         elif self._raised is not None:
@@ -309,6 +337,7 @@ class Isolation:
                 changes.begin()
                 self._kept.clear()
                 self._scored.clear()
+                self._scores_of.clear()
                 return Verdict(1.0, ())
         if self._raised is None and 1.0 - none < DOUBTED:
             return Verdict(none, ())
@@ -316,6 +345,15 @@ class Isolation:
             return Verdict(none, ())  # this cycle does not show the change
         since, sigmas = self._differ(changes)
         return Verdict(none, self._causes(changes, since, 1.0 - none), raised, since, sigmas)
+
+    def _is_worth_an_alarm(self, changes: ChangeDetector) -> bool:
+        """Whether the change is large enough, if the foremost suspect is all of it."""
+        number, _ = changes.foremost()
+        suspect, since = self._suspects[number], self._differ(changes)[0]
+        scores = np.array([scores[number] for scores in list(self._scores_of)[-since:]])
+        off = float(np.nanmean(scores) - self._predictor.mean[number])
+        worth = WORTH * suspect.parameter.typical_on(self._extractor.theta) / suspect.step
+        return abs(off) >= worth * float(self._kept[-1].sigmas()[number])
 
     def _raise(self, changes: ChangeDetector) -> None:
         self._since, sigmas = self._differ(changes)

@@ -26,6 +26,7 @@ from twin.monitor.cycles import (
     CycleView,
     KeyFigureSource,
     figures,
+    lost_a_switching,
     met_no_part,
 )
 from twin.monitor.gaps import gap_event
@@ -55,6 +56,7 @@ LEVELS_ALONE = 0.65
 ALIKE = 0.2  # largest change of figures, over the excess, without a new search for the cause
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # longest time of rows that a PLC keeps while nobody reads them
+MOST_ODD = 2  # cycles: if so few were out, and healthy ones follow, the unit has such cycles
 CLEARS = 3.5  # sigmas of a figure, below which a cycle counts as healthy
 LARGE = 6.0  # sigmas: a cycle must exceed GREW times this for a second cause to begin
 SHORTEST_S = 0.1  # shortest duration of a cycle
@@ -116,7 +118,9 @@ class Monitor:
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
     _farthest: float = 0.0  # largest excess (sigmas) of a cycle since the alarm was raised
     _quiet_cycles: int = 0
+    _odd: list[Mapping[str, float]] = field(default_factory=list)  # cycles out since the alarm
     _without_part: tuple[bool, bool] = False, False  # whether the last two whole cycles met no part
+    _without_switching: tuple[bool, bool] = False, False  # whether they lost the nozzle's switching
     _last: LastRow = field(default_factory=LastRow)
     _fresh: LastRow = field(default_factory=LastRow)  # that is not stale
     _silences: set[int] = field(default_factory=set)  # reported, by PLC time of the row before
@@ -321,6 +325,7 @@ class Monitor:
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
         is_beside = self._is_beside_an_empty_pick(cycle)
+        is_blind = self._is_blind_to_the_nozzle(cycle)
         fit = (
             self.judges
             and whole
@@ -328,6 +333,7 @@ class Monitor:
             and cycle.coverage >= FEWEST_SHARE
             and not stale
             and not is_beside
+            and not is_blind
         )
         *_, (_, theta) = self._surroundings.over(cycle.samples, cycle.ticks)
         theta = following(theta, cycle.samples)
@@ -351,6 +357,17 @@ class Monitor:
             return not (last or second_last)
         return last and not second_last
 
+    def _is_blind_to_the_nozzle(self, cycle: Cycle) -> bool:
+        """Whether a cycle alone has lost its switching.
+
+        If one of the two cycles before had too, the nozzle may not switch at all: it is judged.
+        """
+        if not cycle.complete:
+            return False
+        has_lost, (second_last, last) = lost_a_switching(cycle, self.theta), self._without_switching
+        self._without_switching = last, has_lost
+        return has_lost and not (last or second_last)
+
     def _conclude(
         self, view: CycleView, key_figures: CycleKeyFigures | None, scores: "CycleScores | None"
     ) -> list[Event]:
@@ -369,6 +386,8 @@ class Monitor:
         if not judged or (worst is None and verdict is None):
             return events
         quiet, self._quiet_cycles = self._quiet_cycles, 0
+        if is_out and len(self._odd) <= MOST_ODD:
+            self._odd.append(cycle_figures)
         if worst and is_out:
             if begins:
                 events.append(self._raise_unnamed(worst, cycle))
@@ -380,19 +399,23 @@ class Monitor:
         elif self.active and not self._is_far(worst) and not self._differs:
             self._quiet_cycles = quiet + 1
             if self._quiet_cycles >= self.settings.clear_cycles:
-                events.append(self._cleared(cycle))
-                self.active, self._rival = "", ("", 0)
+                events.append(self._clear(cycle))
         if not is_out:
             self._mixed_cycle = None
         self._farthest = max(self._farthest, far) if self.active else 0.0
         return events
 
-    def _cleared(self, cycle: Cycle) -> Event:
+    def _clear(self, cycle: Cycle) -> Event:
+        """Clear the standing alarm."""
         name_text = f"it had looked like {self.active}"
         if self.active == UNKNOWN:
             name_text = "its cause was not named"
         text = f"measurement and model agree again; {name_text}"
-        return Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
+        event = Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
+        if len(self._odd) <= MOST_ODD:
+            self._baseline.learn_odd(self._odd, self._cycles)
+        self.active, self._rival, self._odd = "", ("", 0), []
+        return event
 
     def _begins(self, cycle: Cycle, far: float) -> bool:
         """Whether something new begins with a cycle that is ``far`` out (sigma).

@@ -86,6 +86,11 @@ class CycleResidual:
         sigmas: Floats = np.sqrt(np.sum((signatures.T @ moves) ** 2, axis=1)) / length
         return sigmas
 
+    def sigmas(self) -> Floats:
+        """Score (sigmas) of one step of each suspect; 0 if this cycle does not show it."""
+        sigmas: Floats = np.sqrt(self._whitened()[2])
+        return sigmas
+
     def sizes(self) -> Floats:
         """Best size (steps) of each suspect by itself; NaN as in ``scores``."""
         off, signatures, power = self._whitened()
