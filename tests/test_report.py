@@ -16,7 +16,7 @@ from matplotlib.text import Annotation
 from written_pages import ENGLISH_WORDS, visible
 
 from twin.diagnosis import drawing
-from twin.diagnosis.answer import Diagnosis, diagnose
+from twin.diagnosis.answer import Diagnosis, _close_runners_up, diagnose
 from twin.diagnosis.drawing import as_narrow_svg, as_svg
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
@@ -49,6 +49,7 @@ from twin.diagnosis.residual_covariance import covariance
 from twin.diagnosis.search import Search
 from twin.diagnosis.text import Times, certainty, when
 from twin.errors import SourceError
+from twin.inference.unmodelled import Odds
 from twin.languages.choice import language_of
 from twin.languages.texts import speaking
 from twin.model.courses import Cause, Course
@@ -965,3 +966,20 @@ def test_the_only_cause_left_is_no_certainty() -> None:
 def test_words_stay_short_for_a_long_log() -> None:
     cycles = {"total": 400, "fitted": list(range(1, 400, 2)), "held_out": list(range(2, 400, 2))}
     assert "held out: 2, 4, 6 … 398 (199 cycles)" in in_words(explained(cycles=cycles))
+
+
+@pytest.mark.parametrize(
+    ("left", "least", "most"), [(0.98, 0.5, 0.6), (1.05, 0.93, 0.97), (1.8, 0.98, 0.99)]
+)
+def test_a_runner_up_that_leaves_hardly_more_makes_a_cause_unsure(
+    left: float, least: float, most: float
+) -> None:
+    known = searched("leak")
+    ranking = [fitted(Cause("leakage", {}), left=0.97), fitted(Cause("sensor_gain", {}), left=left)]
+    alone = replace(known, ranking=ranking, rivals=[[]])
+    close = _close_runners_up(alone, 0.97)
+    assert least <= Odds(0.0).of_cause(1, close) * 0.99 <= most
+    rival = replace(alone, rivals=[[ranking[1]]])  # its weight is that of the log
+    assert _close_runners_up(rival, 0.97) == 0.0
+    several = replace(alone, found=searched("two").found)
+    assert _close_runners_up(several, 0.97) == 0.0

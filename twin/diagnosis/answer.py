@@ -55,6 +55,10 @@ MOST_SATURATED = 0.05  # share of samples
 MOST_JUDGED = 24  # cycles of a long log that are evaluated, evenly spread
 FEW = 0.25  # largest share of odd cycles that are split between fitted and held out separately
 MOST_NAMED = 4  # runners-up
+# Cells of a log that count beside a runner-up. The model's error is alike in neighbouring cells and
+# in all cycles: thousands of cells say no more of causes that both leave little. Chosen by how
+# often stated causes act, docs/decisions/0117-evidence-of-forty-cells.md.
+INDEPENDENT = 40.0
 WIDEST = 0.9  # share of a parameter's range: an interval as wide determines nothing
 MIMICS = 1.6  # times the usual deviation: a cause that leaves more may mimic an unlisted mechanism
 LIKELY = 0.5  # probability of something unlisted above which the verdict is "unlisted"
@@ -159,7 +163,8 @@ def diagnose(
         evidence, fitted, held_out, healthy, before, listed_findings, progress
     )
     is_beside = findings.verdict == "unlisted"
-    probabilities = _probabilities(evidence, searched, odds, is_beside=is_beside)
+    close = _close_runners_up(searched, leftover)
+    probabilities = _probabilities(evidence, searched, odds, close, is_beside=is_beside)
     causes = _causes(evidence, findings.searched, probabilities, before) if findings.causes else []
     for cause, cost in zip(causes, costs(config, evidence, findings.causes, causes), strict=False):
         if cost is not None:  # a price is configured, and a size is known
@@ -458,37 +463,63 @@ def _in_both(group: Ints, held_out: set[int]) -> bool:
 
 
 def _runners_up(searched: Search) -> list[dict[str, Any]]:
-    if searched.found is None:
-        return []
-    runners_up = [fit for fit in searched.ranking if fit.effects != searched.found.effects]
     return [
         {
             "effect": fit.effects[0],
             "course": str(fit.hypothesis[0].course),
             "leftover_sigma": rounded(fit.leftover),
         }
-        for fit in runners_up[:MOST_NAMED]
+        for fit in _next_best(searched)
     ]
+
+
+def _next_best(searched: Search) -> list[Fitted]:
+    """The best single causes beside what was found."""
+    if searched.found is None:
+        return []
+    return [fit for fit in searched.ranking if fit.effects != searched.found.effects][:MOST_NAMED]
 
 
 # --- causes ---------------------------------------------------------------------------------------
 
 
 def _probabilities(
-    evidence: Evidence, searched: Search, odds: Sequence[Odds], *, is_beside: bool = False
+    evidence: Evidence,
+    searched: Search,
+    odds: Sequence[Odds],
+    close: float = 0.0,
+    *,
+    is_beside: bool = False,
 ) -> list[float]:
     """Probability of each cause found, beside its rivals and something unlisted.
 
-    ``is_beside`` says that something unlisted acts.
+    ``close`` is the weight of ``_close_runners_up``. ``is_beside`` says that something unlisted
+    acts.
     """
     if searched.found is None:
         return []
     found = searched.found
     weights = [_weight(evidence, found, rivals) for rivals in searched.rivals]
     return [
-        cause_odds.of_cause(len(found.hypothesis), weight, is_beside=is_beside)
+        cause_odds.of_cause(len(found.hypothesis), weight + close, is_beside=is_beside)
         for cause_odds, weight in zip(odds, weights, strict=True)
     ]
+
+
+def _close_runners_up(searched: Search, leftover: float) -> float:
+    """Weight of the runners-up that leave hardly more than a single cause, ``leftover`` (sigmas).
+
+    Its rivals are left out: the log cannot reject these at all.
+    """
+    if searched.found is None or len(searched.found.hypothesis) > 1:
+        return 0.0
+    rivals = {stranger(rival, searched.found) for rival in searched.rivals[0]}
+    weights = 0.0
+    for fit in _next_best(searched):
+        if fit.effects[0] not in rivals:
+            behind = max(fit.leftover**2 - leftover**2, 0.0) / max(leftover, 1.0) ** 2
+            weights += math.exp(-0.5 * INDEPENDENT * behind)
+    return weights
 
 
 def _is_doubtful(evidence: Evidence, causes: Hypothesis, probabilities: Sequence[float]) -> bool:
