@@ -168,6 +168,13 @@ def test_what_is_not_shown_stays_so_and_what_was_before_stands() -> None:
     assert np.isfinite(shape.take(np.zeros(2)).normal).all()
 
 
+def test_scores_that_hardly_change_have_values_still() -> None:
+    shape = ScoreNormalizer(1)
+    for _ in range(400):
+        shape.learn(shape.take(np.array([3.0])))
+    assert np.isfinite(shape.take(np.array([3.0])).normal).all()
+
+
 def test_far_scores_stay_far() -> None:
     shape = ScoreNormalizer(1)
     for standard in shaped(np.random.default_rng(2), 3000)[:, :1]:

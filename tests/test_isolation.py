@@ -16,7 +16,7 @@ from twin.alarms import watch
 from twin.events import Event, Kind
 from twin.model.catalogue import CatalogueEffect
 from twin.model.effects import EFFECTS, UNKNOWN
-from twin.monitor import isolation
+from twin.monitor import isolation, score_prediction
 from twin.monitor.bins import Floats
 from twin.monitor.cycles import Cycle, CycleView, cut, figures
 from twin.monitor.healthy import Healthy
@@ -314,12 +314,34 @@ def test_a_change_that_begins_is_not_learned_as_usual() -> None:
     assert 20 <= first.data["cycle"] <= 25
 
 
+@pytest.mark.parametrize("wanders", [score_prediction.WANDERS, 0.0])
+def test_scores_of_a_zero_that_wanders_are_independent(
+    wanders: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(score_prediction, "WANDERS", wanders)
+    samples = rigs.recorded("gripper", 160 * SECONDS["gripper"], (), 5)[0].copy()
+    rng, wander = np.random.default_rng(1), np.zeros(len(samples) // 100 + 1)
+    keeps = math.exp(-0.1 / 60.0)
+    for step in range(1, len(wander)):  # 0.4 mbar, with a time constant of a minute
+        kick = rng.normal(0.0, 40.0 * math.sqrt(1.0 - keeps**2))
+        wander[step] = keeps * wander[step - 1] + kick
+    samples["pressure"] += np.interp(np.arange(len(samples)) / 100, np.arange(len(wander)), wander)
+    watched, twin, config = rigs.monitor("gripper"), rigs.twin("gripper"), rigs.config("gripper")
+    watched.isolation = Isolation.of(config.data, config.monitor.healthy, 1e9)  # raises nothing
+    for block in rigs.cut(samples, 5000):
+        watched.update(*twin.advance(block))
+    zero = [suspect.effect for suspect in SUSPECTS].index("sensor_offset")
+    values = np.array(watched.isolation._scored)[20:, zero]
+    next_to = float(np.mean(values[1:] * values[:-1]) / np.mean(values**2))
+    assert next_to < 0.25 if wanders else next_to > 0.5
+
+
 @pytest.mark.parametrize(("worth", "is_told"), [(isolation.WORTH, False), (0.0, True)])
 def test_a_steady_change_too_small_for_an_alarm_is_not_told(
     worth: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(isolation, "WORTH", worth)
-    told = events("gripper", [f"sensor_offset=0.14@c{BEGINS}"], 100, 12)  # of 8 mbar
+    told = events("test_rig", [f"check_valve_leak=0.018@c{BEGINS}"], 80, 12)  # of 1 sl/min
     assert bool(raised(told)) is is_told
 
 

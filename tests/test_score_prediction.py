@@ -29,12 +29,13 @@ def wandering(
     return np.sqrt(share) * wander + np.sqrt(1.0 - share) * own
 
 
-def told(scores: Floats, cosine: float = 1.0) -> Floats:
-    """Normal values of scores that are learned one after another."""
+def told(scores: Floats, cosine: float = 1.0, doubts: Floats | None = None) -> Floats:
+    """Normal values of scores that are learned one after another, with a doubt of each cycle."""
     predictor, values = ScorePredictor(scores.shape[1]), []
     predictor.expect_wander(np.full(scores.shape[1], cosine))
     for cycle, score in enumerate(scores):
-        values.append(predictor.normal(score, cycle * CYCLE_S))
+        doubt = 0.0 if doubts is None else float(doubts[cycle])
+        values.append(predictor.normal(score, cycle * CYCLE_S, doubt))
         predictor.learn(score, cycle * CYCLE_S)
     return np.array(values)
 
@@ -108,6 +109,33 @@ def test_a_wander_is_followed_while_nothing_is_learned() -> None:
     assert abs(next_to[0]) < 0.1
     assert next_to[1] > 0.5
     assert waiting.mean == pytest.approx(predictor.mean, abs=0.3)
+
+
+def test_what_another_day_may_do_beside_a_wander_is_no_change() -> None:
+    scores = wandering(np.random.default_rng(10), 330, 40, 60.0, 0.8)
+    for doubt in (0.5, 2.0):
+        assert alarms(told(scores, doubts=np.where(np.arange(330) < 200, 0.0, doubt))) == 0
+
+
+def test_odd_cycles_that_were_learned_hide_no_later_change() -> None:
+    scores = np.random.default_rng(11).standard_normal((330, 50))
+    scores[[100, 150, 200]] += 40.0
+    healthy = told(scores[:250], 0.0)
+    assert alarms(np.delete(healthy, [100, 150, 200], axis=0)) <= 1
+    scores[250:] += 1.5
+    assert alarms(np.delete(told(scores, 0.0), [100, 150, 200], axis=0)) > 45
+
+
+def test_the_sigma_of_a_score_grows_to_all_of_its_wander_while_nothing_is_learned() -> None:
+    scores = 3.0 * wandering(np.random.default_rng(12), 500, 30, 60.0, 0.9)
+    predictor = ScorePredictor(30)
+    assert predictor.sigma(0.0).tolist() == [1.0] * 30
+    predictor.expect_wander(np.ones(30))
+    for cycle, score in enumerate(scores):
+        predictor.learn(score, cycle * CYCLE_S)
+    soon, later = (predictor.sigma(499 * CYCLE_S + wait).mean() for wait in (3.0, 36_000.0))
+    assert soon < 1.7
+    assert later == pytest.approx(3.0, rel=0.15)
 
 
 def test_a_wander_is_forgotten_in_a_night() -> None:

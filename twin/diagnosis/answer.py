@@ -509,7 +509,8 @@ def _probabilities(
 def _close_runners_up(searched: Search, leftover: float) -> float:
     """Weight of the runners-up that leave hardly more than a single cause, ``leftover`` (sigmas).
 
-    Its rivals are left out: the log cannot reject these at all.
+    That of the cause is of held-out cycles, those of runners-up of the cycles they were fitted to:
+    INDEPENDENT was chosen so. Its rivals are left out: the log cannot reject these at all.
     """
     if searched.found is None or len(searched.found.hypothesis) > 1:
         return 0.0
@@ -570,7 +571,7 @@ def _unmodelled(
 ) -> float:
     """Probability of something unlisted instead of the first cause; from ``alone`` without causes.
 
-    It sums to one with the probabilities of that cause and its rivals. Without causes, under the
+    But for runners-up it sums to one with the probabilities of that cause and its rivals. Without causes, under the
     verdict ``unlisted``, it is at least LIKELY, whatever its course: a smooth one need not recur.
     """
     if searched.found is None:

@@ -5,7 +5,7 @@ cycles show neither mean nor scatter well enough for one false alarm in a month.
 stops, so that a slow change stays visible.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,6 @@ from twin.monitor.healthy import Healthy
 from twin.monitor.score_prediction import FARTHEST, Floats
 
 LEARNED = 300  # healthy cycles of the unit, after which a scatter is known to 4 %
-MISSED = 3.0  # odd cycles: a commissioning that should have had so many shows none in one of 20
 LEARNED_WITHIN = 3.5  # sigmas; a cycle farther out is not learned
 
 
@@ -53,8 +52,7 @@ class Baseline:
         count, mean, sigma = np.array(scatters, np.float64).reshape(-1, 3).T.copy()
         self._reference = Reference(count, mean, (count - 1.0) * sigma**2)
         self._is_rms = np.array([name.endswith("_rms") for name in self.names], bool)
-        self._learned = self._odd = 0
-        self._commissioned = min((scatter[0] for scatter in scatters), default=0)
+        self._learned = 0
 
     @property
     def sigma(self) -> Floats:
@@ -100,18 +98,6 @@ class Baseline:
         if self._learned < LEARNED and not (np.abs(normal) > LEARNED_WITHIN).any():
             self._learned += 1
             self._reference.add(self._values(figures))
-
-    def learn_odd(self, odd: Sequence[Mapping[str, float]], judged: int) -> None:
-        """Learn cycles that were out, once those after them are healthy: the unit has such ones.
-
-        So the first few raise an alarm, and no others. ``judged`` cycles have been seen. Where odd
-        ones are so frequent that the commissioning would have shown some, they are a fault.
-        """
-        self._odd += len(odd)
-        if self._odd / judged * self._commissioned > MISSED:
-            return
-        for figures in odd:
-            self.learn(figures, np.zeros(1))
 
     def _values(self, figures: Mapping[str, float]) -> Floats:
         return np.array([figures.get(name, np.nan) for name in self.names])

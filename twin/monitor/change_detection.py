@@ -32,6 +32,7 @@ WAITS = 4  # cycles for which learning then pauses; a large change raises an ala
 MOST_WAITING = 20  # cycles after which scores that stay strange without an alarm are learned
 # Prior cycles with neither skewness nor correlation; sigmas at which scores are clipped for both.
 UNSKEWED, COUNTS = 100.0, 4.0
+MOST_CORRELATED = 0.9
 SKEWED, LEAST_SKEW = 1.5, 1e-6  # largest skewness; a smaller one counts as none
 
 
@@ -61,6 +62,7 @@ class ScoreNormalizer:
         """Make the scores of the next cycle normal and independent of those before."""
         unskewed = _unskewed(standard, self._cubes / (self._count + UNSKEWED))
         correlation = self._products / (self._count + UNSKEWED)
+        correlation = np.clip(correlation, -MOST_CORRELATED, MOST_CORRELATED)
         carried_over = np.where(np.isfinite(self._before), self._before, 0.0) * correlation
         normal = (unskewed - carried_over) / np.sqrt(1.0 - correlation**2)
         scores = NormalScores(standard, unskewed, self._before, normal)
@@ -137,9 +139,9 @@ class ChangeDetector:
         """Reset the statistics."""
         self._log = np.full(self._shift.shape, -np.inf)
 
-    def begin_some(self, devices: npt.NDArray[np.bool_]) -> None:
-        """Reset the statistics of some devices, if scores of several are taken at once."""
-        self._log[devices] = -np.inf
+    def begin_some(self, some: npt.NDArray[np.bool_]) -> None:
+        """Reset the statistics of some suspects; of some devices if several are taken at once."""
+        self._log[some] = -np.inf
 
     def take(self, normal: Floats, most: float = MOST) -> None:
         """Take the standard normal scores of a cycle; NaN changes nothing.

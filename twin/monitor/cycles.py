@@ -13,7 +13,7 @@ from twin.model import theta as c
 from twin.model.compiled import compiled
 from twin.model.theta import Theta
 from twin.quality import BREAK, UNUSABLE, Quality
-from twin.signals import MBAR, NS, Phase, Samples, Ticks, deviation, joined
+from twin.signals import MBAR, NS, Phase, Reported, Samples, Ticks, deviation, joined
 
 BATCH = 250  # fewest new rows for which models run ahead: each call has a fixed cost
 LONGEST_PIECE = 10_000  # rows; a longer cycle is judged in pieces so that alarms do not wait
@@ -28,6 +28,7 @@ OPEN_CUPS = 1.0 / 3.0
 # Share of the cycles that may have met no part. If more have so little vacuum, or the last LASTING
 # cycles have, something is wrong: a fault, or the unit of measurement.
 MOST_WITHOUT_PART, LASTING = 1.0 / 3.0, 2
+SURELY = 3  # rows beyond H1: one may be noise
 FOUND_WITHIN_S = 0.1  # s after a switching of the nozzle, by which it is found live or never
 PAPER_VACUUM = 600.0 * MBAR  # Pa below ambient, to which the founding paper times evacuation
 
@@ -230,18 +231,22 @@ def lost_a_switching(cycle: Cycle, theta: Theta) -> bool:
     """Whether the nozzle must have switched off in ``cycle``, and no switching was found.
 
     The vacuum reached H1 long before suction ended, and no row is in hold. Then the expected
-    pressure is that of a nozzle that runs on, and says nothing of the rig.
+    pressure is that of a nozzle that runs on, and says nothing of the rig. Where the ejector
+    reports its nozzle, none is lost.
     """
     if (cycle.ticks["phase"] == HOLD).any():
+        return False
+    if (cycle.samples["reported"] & np.uint8(Reported.NOZZLE_KNOWN)).any():
         return False
     in_suction = cycle.ticks["phase"] == SUCTION
     usable = (cycle.samples["quality"] & UNUSABLE) == 0
     vacuum = float(theta[c.AMBIENT]) - cycle.samples["pressure"]
     reached = np.flatnonzero(in_suction & usable & (vacuum >= theta[c.H1]))
-    if not len(reached):
+    if len(reached) < SURELY:
         return False
+    begin, end = reached[SURELY - 1], np.flatnonzero(in_suction)[-1]
     times = cycle.samples["time_ns"]
-    return float(times[np.flatnonzero(in_suction)[-1]] - times[reached[0]]) * NS > FOUND_WITHIN_S
+    return float(times[end] - times[begin]) * NS > FOUND_WITHIN_S
 
 
 def now_and_then(without_part: Sequence[int], total: int) -> list[int]:

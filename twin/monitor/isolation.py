@@ -56,6 +56,7 @@ LEAST_APART = 0.1  # steps of weather, 0.4 mbar or 0.2 K: a day that is less apa
 # Share of a size that is worth an alarm, below which sums raise none: they find a steady change of
 # any size in the end, and nothing of a rig is the same for days.
 WORTH = 0.02
+ALIKE_ENOUGH = 0.5  # cosine, from which another suspect may have found the same change
 DOUBTED = 0.05  # probability of any change, from which a cause is searched
 RETURNED = float(np.log(1000.0))  # log odds of a healthy unit at which a change has ended
 DELAYS_AT = np.array([0.0, *DELAY_STEPS]) / DELAY_STEPS[0]  # evaluated sizes of a delay, in steps
@@ -144,7 +145,8 @@ class Isolation:
         self._scores_of: deque[Floats] = deque(maxlen=KEPT)  # scores of these cycles
         self._cycles, self._seconds = 0, 0.0
         self._ambient_is_measured = self._temperature_is_measured = False
-        self._raised: tuple[int, float] | None = None  # suspect, and size in sigmas per cycle
+        # Suspect, and size in sigmas per cycle and in scores.
+        self._raised: tuple[int, float, float] | None = None
         self._since = 0  # cycles since the change, while raised
         self._back = 0.0  # log odds that the unit is healthy again
         self._alike = np.zeros((count, count))  # cosines between signatures; 0 if unknown
@@ -221,9 +223,8 @@ class Isolation:
         """
         self._cycles += 1
         self._seconds += cycle.seconds
-        step = self._normalizer.take(
-            self._ahead.normal(self._beside_weather(cycle), cycle.day.seconds)
-        )
+        scores = self._ahead.normal(cycle.scores, cycle.day.seconds, self._doubt(cycle))
+        step = self._normalizer.take(scores)
         normal = step.normal
         self._last_day = cycle.day
         self._kept.append(cycle.residual)
@@ -267,16 +268,10 @@ class Isolation:
         names |= {kind: (LEVELS[kind],) for kind in most if kind < 0}
         return {name: doubt for kind, doubt in most.items() for name in names[kind]}
 
-    def _beside_weather(self, cycle: CycleScores) -> Floats:
-        """Scores less what the model's error on the day of a cycle may have done."""
+    def _doubt(self, cycle: CycleScores) -> Floats | float:
+        """By how much each score may be off by the model's error on the day of a cycle."""
         ways = self._ways(cycle.residual, cycle.day)
-        if ways is None:
-            return cycle.scores
-        mean = self._predictor.mean
-        off = cycle.scores - mean
-        doubt = DAY * cycle.residual.moved_by(ways)
-        scores: Floats = mean + np.sign(off) * np.maximum(np.abs(off) - doubt, 0.0)
-        return scores
+        return 0.0 if ways is None else DAY * cycle.residual.moved_by(ways)
 
     def _ways(self, residual: CycleResidual, day: Day) -> Floats | None:
         """Model's errors (mbar, one sigma each) on another day than that of the learned cycles.
@@ -327,7 +322,7 @@ class Isolation:
         none = 1.0 / (1.0 + math.exp(min(log_odds, 700.0)))
         raised = self._raised is None and log_sum >= limit(cycles)
         if raised and not self._is_worth_an_alarm(changes):
-            changes.begin()
+            changes.begin_some(np.abs(self._alike[changes.foremost()[0]]) > ALIKE_ENOUGH)
             return Verdict(1.0, ())
         if raised:
             self._raise(changes)
@@ -350,22 +345,35 @@ class Isolation:
         """Whether the change is large enough, if the foremost suspect is all of it."""
         number, _ = changes.foremost()
         suspect, since = self._suspects[number], self._differ(changes)[0]
-        scores = np.array([scores[number] for scores in list(self._scores_of)[-since:]])
-        off = float(np.nanmean(scores) - self._predictor.mean[number])
         worth = WORTH * suspect.parameter.typical_on(self._extractor.theta) / suspect.step
-        return abs(off) >= worth * float(self._kept[-1].sigmas()[number])
+        sigmas = next(
+            (step for kept in reversed(self._kept) if (step := kept.sigmas()[number]) > 0.0), 0.0
+        )
+        return abs(self._moved(number, since)) >= worth * float(sigmas)
+
+    def _moved(self, number: int, since: int) -> float:
+        """Mean score of a suspect in so many last cycles, less the usual one."""
+        scores = np.array([scores[number] for scores in list(self._scores_of)[-since:]])
+        return float(np.nanmean(scores) - self._predictor.mean[number])
 
     def _raise(self, changes: ChangeDetector) -> None:
         self._since, sigmas = self._differ(changes)
-        self._raised = (changes.foremost()[0], sigmas)
+        number, _ = changes.foremost()
+        self._raised = (number, sigmas, self._moved(number, self._since))
         self._back = 0.0
 
     def _is_back(self, normal: Floats) -> bool:
-        """Whether the unit is healthy again, by a likelihood ratio over the cycles since."""
+        """Whether the unit is healthy again, by a likelihood ratio over the cycles since.
+
+        While nothing is learned, a wander makes predictions less sure: the same change is fewer
+        sigmas then.
+        """
         assert self._raised is not None
-        suspect, sigmas = self._raised
+        suspect, sigmas, moved = self._raised
         if np.isnan(normal[suspect]):
             return False
+        now = abs(moved) / float(self._ahead.sigma(self._last_day.seconds)[suspect])
+        sigmas = math.copysign(min(abs(sigmas), now), sigmas)
         gain = sigmas * (0.5 * sigmas - float(normal[suspect]))
         self._back = max(self._back + min(gain, RETURNED / FEWEST_BACK), 0.0)
         if self._back < RETURNED:

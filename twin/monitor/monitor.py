@@ -56,7 +56,6 @@ LEVELS_ALONE = 0.65
 ALIKE = 0.2  # largest change of figures, over the excess, without a new search for the cause
 RENAMED = 3  # cycles in a row that must agree on another name before a standing alarm gets it
 LONGEST_RING_NS = 120_000_000_000  # longest time of rows that a PLC keeps while nobody reads them
-MOST_ODD = 2  # cycles: if so few were out, and healthy ones follow, the unit has such cycles
 CLEARS = 3.5  # sigmas of a figure, below which a cycle counts as healthy
 LARGE = 6.0  # sigmas: a cycle must exceed GREW times this for a second cause to begin
 SHORTEST_S = 0.1  # shortest duration of a cycle
@@ -118,7 +117,6 @@ class Monitor:
     _rival: tuple[str, int] = ("", 0)  # another name for the standing alarm, cycles that gave it
     _farthest: float = 0.0  # largest excess (sigmas) of a cycle since the alarm was raised
     _quiet_cycles: int = 0
-    _odd: list[Mapping[str, float]] = field(default_factory=list)  # cycles out since the alarm
     _without_part: tuple[bool, bool] = False, False  # whether the last two whole cycles met no part
     _without_switching: tuple[bool, bool] = False, False  # whether they lost the nozzle's switching
     _last: LastRow = field(default_factory=LastRow)
@@ -325,7 +323,6 @@ class Monitor:
         whole = cycle.complete or len(cycle.samples) >= LONGEST_PIECE
         stale = silent or cycle.stale or (before is not None and before.stale)
         is_beside = self._is_beside_an_empty_pick(cycle)
-        is_blind = self._is_blind_to_the_nozzle(cycle)
         fit = (
             self.judges
             and whole
@@ -333,10 +330,10 @@ class Monitor:
             and cycle.coverage >= FEWEST_SHARE
             and not stale
             and not is_beside
-            and not is_blind
         )
         *_, (_, theta) = self._surroundings.over(cycle.samples, cycle.ticks)
         theta = following(theta, cycle.samples)
+        fit = not self._is_blind_to_the_nozzle(cycle, theta) and fit
         cycle_figures = figures(cycle, theta)
         if not self.judges:  # leave out figures that depend on the model
             cycle_figures = {
@@ -357,14 +354,14 @@ class Monitor:
             return not (last or second_last)
         return last and not second_last
 
-    def _is_blind_to_the_nozzle(self, cycle: Cycle) -> bool:
+    def _is_blind_to_the_nozzle(self, cycle: Cycle, theta: Theta) -> bool:
         """Whether a cycle alone has lost its switching.
 
         If one of the two cycles before had too, the nozzle may not switch at all: it is judged.
         """
         if not cycle.complete:
             return False
-        has_lost, (second_last, last) = lost_a_switching(cycle, self.theta), self._without_switching
+        has_lost, (second_last, last) = lost_a_switching(cycle, theta), self._without_switching
         self._without_switching = last, has_lost
         return has_lost and not (last or second_last)
 
@@ -386,8 +383,6 @@ class Monitor:
         if not judged or (worst is None and verdict is None):
             return events
         quiet, self._quiet_cycles = self._quiet_cycles, 0
-        if is_out and len(self._odd) <= MOST_ODD:
-            self._odd.append(cycle_figures)
         if worst and is_out:
             if begins:
                 events.append(self._raise_unnamed(worst, cycle))
@@ -412,9 +407,7 @@ class Monitor:
             name_text = "its cause was not named"
         text = f"measurement and model agree again; {name_text}"
         event = Event(cycle.end_ns, Kind.DEVIATION_CLEARED, text, {"effect": self.active})
-        if len(self._odd) <= MOST_ODD:
-            self._baseline.learn_odd(self._odd, self._cycles)
-        self.active, self._rival, self._odd = "", ("", 0), []
+        self.active, self._rival = "", ("", 0)
         return event
 
     def _begins(self, cycle: Cycle, far: float) -> bool:

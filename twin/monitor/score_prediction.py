@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri, stdtr
 
-from twin.monitor.change_detection import ALIKE
+from twin.monitor.change_detection import ALIKE, MOST
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -28,11 +28,12 @@ FARTHEST = 30.0  # sigmas; the probability beyond underflows
 TIMES = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)  # s, time constants of a wander, to an hour
 SHARES = (0.3, 0.6, 0.9)  # of the score's variance
 # Prior probability that air pressure or a sensor's zero wanders: it does in some halls and not in
-# others. Chosen; docs/decisions/0115-scores-that-wander.md has what other values do.
+# others. Chosen.
 WANDERS = 0.5
 # Least log odds of a model by what it has predicted, and least ones of a wander over those of the
 # constant mean: air may begin to wander after long calm, and become calm again.
 FORGOTTEN, CALM = -20.0, -7.0
+FEW = 10  # scores, from which their sigma is known well enough to call one odd
 _MODELS = [(1.0, 0.0), *itertools.product(TIMES, SHARES)]  # the first is the constant mean
 _TIME, _SHARE = np.array(_MODELS).T[:, :, None]
 
@@ -65,7 +66,7 @@ class ScorePredictor:
     def expect_wander(self, cosines: Floats) -> None:
         """Set the prior of each suspect by its cosine with the air pressure or the zero.
 
-        Other scores hardly wander: a wander would pass for a slow change of the suspect.
+        Other scores hardly wander beforehand: a wander would pass for a slow change.
         """
         wanders = WANDERS * np.abs(cosines) ** ALIKE
         each = np.repeat(wanders[None] / (len(_MODELS) - 1), len(_MODELS) - 1, axis=0)
@@ -77,27 +78,40 @@ class ScorePredictor:
         mean: Floats = np.sum(self._probability() * self._mean, axis=0)
         return mean
 
-    def normal(self, scores: Floats, seconds: float) -> Floats:
+    def normal(self, scores: Floats, seconds: float, doubt: Floats | float = 0.0) -> Floats:
         """Scores of a cycle as standard normal values, by their predicted distribution.
 
-        ``seconds`` is the time of the cycle. NaN without a score, or while fewer than two are known
-        of the suspect, or if these were equal.
+        ``seconds`` is the time of the cycle. Scores within ``doubt`` of a prediction are not off,
+        others are off by as much less. NaN without a score, or while fewer than two are known of
+        the suspect, or if these were equal.
         """
-        next_one = self._predict(scores, seconds)
+        known = self._predict(scores, seconds)
         is_known, freedom = self._freedom()
-        sigma = np.sqrt(np.where(is_known, next_one.variance * self._squares, 1.0) / freedom)
-        probability, t = self._probability(), next_one.off / sigma
+        off = np.sign(known.off) * np.maximum(np.abs(known.off) - doubt, 0.0)
+        probability, t = self._probability(), off / self._sigmas(known)
         below, above = (np.sum(probability * stdtr(freedom, side), axis=0) for side in (t, -t))
         far = np.minimum(-ndtri(np.minimum(below, above)), FARTHEST)
         return np.where(is_known, np.where(below < above, -far, far), np.nan)
 
+    def sigma(self, seconds: float) -> Floats:
+        """Sigma of each suspect's score in a cycle at a time; 1 while none is known."""
+        known = self._predict(np.zeros(len(self.count)), seconds)
+        variance: Floats = np.sum(self._probability() * self._sigmas(known) ** 2, axis=0)
+        return np.sqrt(variance)
+
     def learn(self, scores: Floats, seconds: float) -> None:
-        """Learn the scores of a healthy cycle; NaN changes nothing."""
+        """Learn the scores of a healthy cycle; NaN changes nothing.
+
+        Once FEW are known, a score farther off than MOST sigmas counts as so far: a single odd
+        cycle must not hide later changes.
+        """
         is_shown = np.isfinite(scores)
         is_first = is_shown & (self.count == 0.0)
         self._begin(is_first, scores)
         again = is_shown & ~is_first
         known = self._predict(np.where(again, scores, 0.0), seconds)
+        most = np.where(self.count >= FEW, MOST * self._sigmas(known), np.inf)
+        known = known._replace(off=np.clip(known.off, -most, most))
         self._weigh(again, known)
         self._filter(again, known)
         self._squares = self._squares + np.where(again, known.off**2 / known.variance, 0.0)
@@ -105,14 +119,23 @@ class ScorePredictor:
         self._at = np.where(is_shown, seconds, self._at)
 
     def follow(self, scores: Floats, seconds: float) -> None:
-        """Follow the wander of a cycle that is not learned: sigmas and probabilities stay.
+        """Follow the wander of a cycle that is not learned: sigma and the constant mean stay.
 
         Without it the next prediction would be as far off as this one.
         """
         is_shown = np.isfinite(scores) & (self.count > 0.0)
         known = self._predict(np.where(is_shown, scores, 0.0), seconds)
+        self._weigh(is_shown, known)
         self._filter(is_shown & (_SHARE > 0.0), known)
         self._at = np.where(is_shown, seconds, self._at)
+
+    def _sigmas(self, known: _Prediction) -> Floats:
+        """Sigma of the score by each model; 1 while it is not known."""
+        is_known, freedom = self._freedom()
+        sigmas: Floats = np.where(
+            is_known, np.sqrt(np.maximum(known.variance * self._squares, 0.0) / freedom), 1.0
+        )
+        return sigmas
 
     def _freedom(self) -> tuple[Bools, Floats]:
         """Whether the sigma of a suspect is known, and its degrees of freedom (1 if not)."""
