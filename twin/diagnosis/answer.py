@@ -571,8 +571,9 @@ def _unmodelled(
 ) -> float:
     """Probability of something unlisted instead of the first cause; from ``alone`` without causes.
 
-    But for runners-up it sums to one with the probabilities of that cause and its rivals. Without causes, under the
-    verdict ``unlisted``, it is at least LIKELY, whatever its course: a smooth one need not recur.
+    But for runners-up it sums to one with the probabilities of that cause and its rivals. Without
+    causes, under the verdict ``unlisted``, it is at least LIKELY, whatever its course: a smooth one
+    need not recur.
     """
     if searched.found is None:
         return round(max(alone, LIKELY) if verdict == "unlisted" else alone, 3)
