@@ -635,10 +635,16 @@ def latency_ms(model: Samples, plc: Samples) -> np.ndarray:
 
 
 def status(port: int, unit: int = 1) -> int:
-    link = ModbusClient(driver(port).model_copy(update={"unit": unit}))
-    link.open()
-    with closing(link):
-        return int(link.read(Address("input", 4), 1)[0])
+    """Its commands, asked again where a PLC has no time to answer: the computer may be busy."""
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        link = ModbusClient(driver(port).model_copy(update={"unit": unit}))
+        link.open()
+        with closing(link):
+            try:
+                return int(link.read(Address("input", 4), 1)[0])
+            except LostError:
+                assert time.monotonic() < end
 
 
 def commands(port: int, unit: int) -> int:
