@@ -16,7 +16,7 @@ from matplotlib.text import Annotation
 from written_pages import ENGLISH_WORDS, visible
 
 from twin.diagnosis import drawing
-from twin.diagnosis.answer import Diagnosis, _close_runners_up, diagnose
+from twin.diagnosis.answer import INDEPENDENT, Diagnosis, _close_runners_up, diagnose
 from twin.diagnosis.drawing import as_narrow_svg, as_svg
 from twin.diagnosis.evidence import HEALTHY, Evidence, Hypothesis, collect
 from twin.diagnosis.fit import Fitted
@@ -969,7 +969,7 @@ def test_words_stay_short_for_a_long_log() -> None:
 
 
 @pytest.mark.parametrize(
-    ("left", "least", "most"), [(0.98, 0.5, 0.6), (1.05, 0.93, 0.97), (1.8, 0.98, 0.99)]
+    ("left", "least", "most"), [(0.98, 0.55, 0.65), (1.05, 0.95, 0.97), (1.8, 0.99, 1.0)]
 )
 def test_a_runner_up_that_leaves_hardly_more_makes_a_cause_unsure(
     left: float, least: float, most: float
@@ -978,7 +978,11 @@ def test_a_runner_up_that_leaves_hardly_more_makes_a_cause_unsure(
     ranking = [fitted(Cause("leakage", {}), left=0.97), fitted(Cause("sensor_gain", {}), left=left)]
     alone = replace(known, ranking=ranking, rivals=[[]])
     close = _close_runners_up(alone, 0.97)
-    assert least <= Odds(0.0).of_cause(1, close) * 0.99 <= most
+    assert least <= Odds(0.0).of_cause(1, close) <= most
+    # Where both leave much, it is their ratio that counts.
+    large = replace(alone, ranking=[fitted(Cause("sensor_gain", {}), left=2.0 * left)])
+    in_sigmas = np.exp(-0.5 * INDEPENDENT * max(4.0 * left**2 - 4.0, 0.0) / 4.0)
+    assert _close_runners_up(large, 2.0) == pytest.approx(in_sigmas)
     rival = replace(alone, rivals=[[ranking[1]]])  # its weight is that of the log
     assert _close_runners_up(rival, 0.97) == 0.0
     several = replace(alone, found=searched("two").found)
