@@ -961,6 +961,8 @@ def test_the_only_cause_left_is_no_certainty() -> None:
     """It may be one that nobody listed: the probability counts that."""
     alone = certainty(LEAK | {"probability": 0.96, "not_separable_from": []})
     assert alone == "96 %; no other listed cause fits as well"
+    unsure = certainty(LEAK | {"probability": 0.58, "not_separable_from": []})
+    assert unsure == "58 %; other causes, listed or not, are not ruled out"
 
 
 def test_words_stay_short_for_a_long_log() -> None:

@@ -15,6 +15,7 @@ from twin.model.courses import Course
 from twin.model.effects import effect_of
 
 Answer = Mapping[str, Any]
+PLAIN = 0.9  # probability, from which runners-up and what is unlisted need no word
 MOST_LISTED = 12  # cycles listed by number
 MOST_FINER = 3  # extra digits at most, to tell the ends of an interval apart
 LONG_S = 120.0  # from here on times are in minutes
@@ -319,6 +320,8 @@ def certainty(cause: Answer) -> str:
     """Probability of a cause, compared with its look-alikes and something unlisted."""
     alike = listed([spoken(name) for name in cause["not_separable_from"]], tr("or"))
     percent = f"{100.0 * cause['probability']:.0f} %"
+    if not alike and cause["probability"] < PLAIN:
+        return tr("{percent}; other causes, listed or not, are not ruled out", percent=percent)
     if not alike:
         return tr("{percent}; no other listed cause fits as well", percent=percent)
     return tr("{percent}; this log cannot tell it from {alike}", percent=percent, alike=alike)
